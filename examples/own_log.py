@@ -12,6 +12,7 @@ DIR/boxes.csv        stamp,track,class,x,y,z,length,width,height,yaw in the vehi
 
 import csv
 import json
+import shlex
 import sys
 from pathlib import Path
 
@@ -49,6 +50,8 @@ def main(folder: Path) -> None:
         track["at"].append({"frame": number[stamp], "world_from_box": box.tolist()})
     rig = {"cameras": cameras, "frames": frames, "boxes": list(tracks.values())}
     (folder / "rig.json").write_text(json.dumps(rig | {"lidar": {"vehicle_from_lidar": np.eye(4).tolist()}}))
+    found = f"frames: {len(frames)}, cameras: {len(cameras)}, tracks of boxes: {len(tracks)}"
+    print(f"{folder / 'rig.json'}: {found}; now sparsestreet data check {shlex.quote(str(folder))}")
 
 
 if __name__ == "__main__":

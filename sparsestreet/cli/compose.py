@@ -3,7 +3,7 @@
 import io
 import re
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -15,6 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
 from sparsestreet.cli.limits import limit_problem
@@ -33,6 +34,11 @@ WORDS = {
 """Words of the field -> our key."""
 MOVED = {"data.log.min_lens_shift": "effects.lens.min_shift"}
 """Keys of earlier versions -> where their value belongs now."""
+PATHS = {
+    *("out", "resume", "count_of", "data.root", "data.log.root", "data.log.parent", "image_points.cache"),
+    *("hydra.run.dir", "hydra.sweep.dir"),
+}
+"""Keys whose value is a path, in whatever letters."""
 SHORT = 4
 """Letters of a word below which another word is like it by chance (lr, logger)."""
 FEW_PLACES = 6
@@ -127,12 +133,60 @@ def override_problem(overrides: list[str]) -> str | None:
         cfg = composed(single)
     except OverrideParseException as error:
         return f"{error.override!r} cannot be read: put a value with special characters in quotes, key='a=b'"
+    except YAMLError as error:
+        return " ".join(str(error).split())
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         cause = error.__cause__ or error
         key = getattr(cause, "full_key", None)
         reason = str(cause)
         return _explain(f"{key}: {reason}" if key and key not in reason.splitlines()[0] else reason, single)
     return limit_problem(cfg) or _masks_that_are_off(single, cfg)
+
+
+def as_typed(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with quotes of Hydra's around a value that its grammar reads as something else than was typed.
+
+    A shell takes its own quotes away, so a folder's name comes with its spaces, commas and letters alone. Lists of a
+    sweep stay lists, unless there is a file of the whole name.
+    """
+    several = bool({"-m", "--multirun"} & set(arguments))
+    return [_as_typed(text, several) for text in arguments]
+
+
+def _as_typed(text: str, several: bool) -> str:
+    key, equals, value = text.partition("=")
+    if text.startswith("-") or not equals or not value or value[0] + value[-1] in ("''", '""') or "${" in value:
+        return text
+    path = key in PATHS
+    try:
+        override = OverridesParser.create().parse_override(text)
+    except HydraException:
+        plain = not set(value) & set("[]{}()'\",")
+        return f"{key}={_in_quotes(value)}" if path or plain else text
+    if not path or value == "null" or (override.is_sweep_override() and several and not Path(value).exists()):
+        return text
+    return text if override.value() == value else f"{key}={_in_quotes(value)}"
+
+
+def quoted(value: str) -> str:
+    """A text as Hydra's grammar takes it, whatever characters it has.
+
+    >>> quoted("a/b-1"), quoted("it's ö")
+    ('a/b-1', "'it\\\\'s ö'")
+    """
+    return value if re.fullmatch(r"[A-Za-z0-9_./-]+", value) else _in_quotes(value)
+
+
+def _in_quotes(value: str) -> str:
+    # A backslash before a quote, or at the end, stands for itself where it is doubled.
+    escaped = re.sub(r"(\\*)('|$)", lambda end: 2 * end[1] + ("\\'" if end[2] else ""), value)
+    return f"'{escaped}'"
+
+
+def value_of(text: str) -> str:
+    """The value of an override without Hydra's quotes; a list of a sweep as it was typed."""
+    override = OverridesParser.create().parse_override(text)
+    return text.partition("=")[2] if override.is_sweep_override() else str(override.value())
 
 
 def without_flags(overrides: Sequence[str]) -> list[str]:
@@ -169,6 +223,8 @@ def _sparsify_with_masks() -> str:
 
 def _explain(reason: str, overrides: list[str]) -> str:
     """Hydra's reason (its first line names what is wrong) with the whole key and the key or option that was meant."""
+    if (place := re.match(r"In '([^']+)': (.+)", reason, re.S)) and place[1] != "train":
+        return f"{place[1]}.yaml: {_explain_file(place[2], overrides)}"
     said, given = reason.splitlines()[0], [text.partition("=")[0].lstrip("+~") for text in overrides]
     if "Got NoneType" in said:
         group = next((key for key, _, value in (text.partition("=") for text in overrides) if value == "null"), "")
@@ -188,7 +244,24 @@ def _explain(reason: str, overrides: list[str]) -> str:
         return f"no key {key!r}; did you mean {places[1].replace(', ', ' or ')}?{_options_of(key)}"
     if key in _known()[0] or (CONF / _group(key)).is_dir():
         return f"no key {key!r} with these choices: leave it out, or choose the option that has it"
-    return _unknown_key(key)
+    return _unknown_key(key, overrides)
+
+
+def _explain_file(reason: str, overrides: list[str]) -> str:
+    """What is wrong within a file of a group, which is somebody's own."""
+    first, _, rest = reason.partition("\n")
+    if first.endswith("raised while composing config:"):
+        key = re.search(r"full_key: (\S+)", rest)
+        return _unknown_key(key[1]) if key and " not in " in rest else _explain(rest, overrides)
+    chosen = re.search(r"Could not override '([^'@]+)(@[^']*)?'. No match", first)
+    if chosen and (CONF / f"{chosen[1]}.yaml").is_file():
+        keys = chosen[1].replace("/", ".")
+        return (
+            f"'override /{chosen[1]}' needs a group, and conf/{chosen[1]}.yaml is a file: set {keys}.KEY in your file"
+        )
+    if chosen:
+        return f"'override /{chosen[1]}{chosen[2] or ''}' overrides nothing that the defaults before it choose"
+    return _explain(reason, overrides)
 
 
 def _no_option(name: str, group: str) -> str:
@@ -214,11 +287,11 @@ def _group(key: str) -> str:
     return key.partition("@")[0]
 
 
-def _unknown_key(key: str) -> str:
+def _unknown_key(key: str, overrides: Sequence[str] = ()) -> str:
     """One line with the key that was probably meant, or the few that it may be, and the options where it is a group."""
     if key in MOVED:
         return f"no key {key!r}: it is {MOVED[key]!r} now"
-    meant = _meant(key)
+    meant = _meant(key, overrides)
     if not meant:
         return f"no key {key!r}; sparsestreet train --cfg job prints all"
     if len(meant) == 1:
@@ -226,11 +299,20 @@ def _unknown_key(key: str) -> str:
     return f"no key {key!r}; did you mean {', '.join(meant[:-1])} or {meant[-1]}?"
 
 
-def _meant(key: str) -> list[str]:
-    """Keys by another word of the field's, by their last name, else the one that is most like it."""
+def _meant(key: str, overrides: Sequence[str] = ()) -> list[str]:
+    """Keys by another word of the field's, by their last name, else the one that is most like it.
+
+    Known are the keys of the default configuration, and those that the other overrides bring.
+    """
     if key in WORDS:
         return [WORDS[key]]
     known, leaders = _known()
+    groups = [text for text in overrides if "." not in text.partition("=")[0].partition("@")[0]]
+    with suppress(HydraException, OmegaConfBaseException, ValueError):
+        chosen = composed(
+            [text for text in groups if not text.startswith(("+", key)) and text.partition("=")[0] != key]
+        )
+        known = (*known, *(set(_keys(OmegaConf.to_container(chosen, resolve=False))) - set(known)))
     alike = 0.5 if len(key) >= SHORT else 0.8
     found = [] if "." in key else _by_last_name(key, known)
     found = found or nearest(key, known, cutoff=alike)

@@ -1,12 +1,12 @@
 """``sparsestreet demo``: a street, trained plain, with the paper's method and with ours; one table and pictures."""
 
-import re
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from sparsestreet.cli.compose import quoted
 from sparsestreet.cli.report import report
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.report.side_by_side import compare_runs
@@ -41,7 +41,7 @@ def demo(arguments: list[str]) -> int:
     for sparsify in SPARSIFY:
         print(f"\n== sparsify={sparsify} ==", flush=True)
         chosen = [f"sparsify={sparsify}", f"assignment={ASSIGNMENT}", f"schedule.max_steps={STEPS}", "overwrite=true"]
-        overrides = [*chosen, f"out={_quoted(out / sparsify)}", *arguments]
+        overrides = [*chosen, f"out={quoted(str(out / sparsify))}", *arguments]
         # A process each: what one training leaves in memory does not slow the next.
         status = subprocess.run([sys.executable, "-m", "sparsestreet", "train", *overrides], check=False).returncode
         if status < 0:
@@ -72,9 +72,3 @@ def _folder(arguments: Sequence[str]) -> tuple[Path, list[str]]:
     if len(places) > 1 or "" in places:
         raise ValueError("out=DIR names one folder, or is left out")
     return Path(places[0]) if places else OUT, [text for text in arguments if not text.startswith("out=")]
-
-
-def _quoted(path: Path) -> str:
-    """As Hydra's grammar takes it, whatever characters a folder's name has."""
-    text = str(path)
-    return text if re.fullmatch(r"[\w./-]+", text) else "'" + text.replace("'", "\\'") + "'"

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import composed, override_problem
+from sparsestreet.cli.compose import as_typed, composed, override_problem, value_of
 from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.records.effects import EffectDecision
 
@@ -38,7 +38,7 @@ def effects(arguments: list[str]) -> int:
         print(USAGE)
         return 0
     try:
-        overrides, found = with_found_data(with_effect_keys(arguments))
+        overrides, found = with_found_data(as_typed(with_effect_keys(arguments)))
         problem = override_problem(overrides) or config_problem(composed(overrides))
         if problem:
             raise ValueError(problem)
@@ -48,7 +48,7 @@ def effects(arguments: list[str]) -> int:
     if found:
         print(found)
     try:
-        asked = next((Path(text.partition("=")[2]) for text in overrides if text.startswith("out=")), None)
+        asked = next((Path(value_of(text)) for text in overrides if text.startswith("out=")), None)
         print("\n".join(_plan(composed(overrides), asked)))
     except BrokenPipeError:
         raise  # somebody reads no more of our output

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hydra import compose
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -17,21 +15,33 @@ from rich.console import Console
 from rich.table import Table
 
 from sparsestreet.cli.branch import first_pruning, identity_of_trunk, moments_to_keep
-from sparsestreet.cli.compose import configuration, override_problem, resolved
+from sparsestreet.cli.compose import as_typed, configuration, override_problem, resolved
+from sparsestreet.cli.flags import SWEEPS, flags_of
 from sparsestreet.cli.folder import identity_of_run
-from sparsestreet.cli.sweep import finished
+from sparsestreet.cli.sweep import finished, jobs_of, with_fixed_keys
 from sparsestreet.records.configuration import flat_config
 
 USAGE = """\
 sparsestreet jobs +sweep=NAME[,NAME ...] [key=value ...]
+sparsestreet jobs -m key=value,value [key=value ...]
 
-What sweeps of conf/sweep would train, with the options that train would get; nothing is trained or written. A job
-repeats another where its options, seed and drive are those of a job before it, in its own sweep or in one that is named
-before: with reuse=true (conf/train.yaml) it is trained once. A job that stands finished in its folder is not trained
-again either. One that differs from a job before it only in what it prunes begins with a checkpoint of that job
-(branch_points), so the last column has what is trained in whole runs, one sweep after the other on one device. Drives
-need not be there: data.root=a,b,c counts three.
+What sweeps of conf/sweep, or one of the command line, would train, with the options that train would get; nothing is
+trained or written. A job repeats another where its options, seed and drive are those of a job before it, in its own
+sweep or in one that is named before: with reuse=true (conf/train.yaml) it is trained once. A job that stands finished
+in its folder is not trained again either. One that differs from a job before it only in what it prunes begins with a
+checkpoint of that job (branch_points), so the last column has what is trained in whole runs, one sweep after the other
+on one device. Drives need not be there: data.root=a,b,c counts three.
 """
+
+
+COMMAND_LINE = "-m"
+"""What a sweep is called that no file of conf/sweep holds."""
+_EVERY = 10
+"""Jobs after which a line says how far the count is: a composition takes a second of a busy machine."""
+
+
+def _sweep(name: str) -> list[str]:
+    return [] if name == COMMAND_LINE else [f"+sweep={name}"]
 
 
 @dataclass(frozen=True)
@@ -58,12 +68,14 @@ class SweepCount:
 
 def jobs(arguments: list[str]) -> int:
     """Print the counts; 2 on wrong usage."""
-    names = [name for text in arguments if text.startswith("+sweep=") for name in text[7:].split(",")]
-    if not names or "--help" in arguments:
+    arguments = as_typed(arguments)
+    named = [name for text in arguments if text.startswith("+sweep=") for name in text[7:].split(",")]
+    names = named or [COMMAND_LINE]
+    if "--help" in arguments or not (named or SWEEPS & flags_of(arguments)):
         print(USAGE)
         return 0 if "--help" in arguments else 2
-    rest = [text for text in arguments if not text.startswith("+sweep=")]
-    problem = next(filter(None, (override_problem(["-m", f"+sweep={name}", *rest]) for name in names)), None)
+    rest = [text for text in arguments if not text.startswith("+sweep=") and text not in SWEEPS]
+    problem = next(filter(None, (override_problem(["-m", *_sweep(name), *rest]) for name in names)), None)
     if problem:
         print(f"sparsestreet jobs: {problem}", file=sys.stderr)
         return 2
@@ -82,7 +94,7 @@ def count_jobs(names: Sequence[str], overrides: Sequence[str]) -> list[SweepCoun
     counts = []
     with configuration():
         for name in names:
-            found = list(_jobs_of([f"+sweep={name}", *overrides]))
+            found = list(_jobs_of(with_fixed_keys(["-m", *_sweep(name), *overrides])[1:]))
             new = {job.identity: job for job in found if job.identity not in seen}
             seen |= new.keys()
             shared = sum(0.0 if job.done else job.begins(kept[job.trunk]) for job in new.values())
@@ -112,17 +124,16 @@ class _Job:
 
 
 def _jobs_of(overrides: Sequence[str]) -> Iterator[_Job]:
-    given = [text for text in overrides if not _is_sweep(text)]
-    params = compose("train", given, return_hydra_config=True).hydra.sweeper.params or {}
-    asked = OverridesParser.create().parse_overrides([*(f"{key}={value}" for key, value in params.items()), *overrides])
-    for batch in BasicSweeper.split_arguments(asked, max_batch_size=None):
-        for words in batch:
-            cfg = compose("train", [*words, "folder=."], return_hydra_config=True)
-            out = Path(cfg.hydra.sweep.dir, cfg.hydra.sweep.subdir)
-            with open_dict(cfg):
-                del cfg["hydra"]
-            cfg.folder = str(out)
-            yield _job(cfg, out, done=out.is_dir() and finished(cfg, out) is not None)
+    words_of_jobs = list(jobs_of(overrides))
+    for number, words in enumerate(words_of_jobs):
+        if number and number % _EVERY == 0:
+            print(f"{number} of {len(words_of_jobs)} jobs composed", file=sys.stderr, flush=True)
+        cfg = compose("train", [*words, "folder=.", f"hydra.job.num={number}"], return_hydra_config=True)
+        out = Path(cfg.hydra.sweep.dir, cfg.hydra.sweep.subdir)
+        with open_dict(cfg):
+            del cfg["hydra"]
+        cfg.folder = str(out)
+        yield _job(cfg, out, done=out.is_dir() and finished(cfg, out) is not None)
 
 
 def _job(cfg: DictConfig, out: Path, done: bool) -> _Job:
@@ -132,10 +143,6 @@ def _job(cfg: DictConfig, out: Path, done: bool) -> _Job:
         return _Job(out, out, 0.0, (), done)  # what it trains follows from a run that is not there yet
     first = first_pruning(config)
     return _Job(identity_of_run(config), identity_of_trunk(config), first, moments_to_keep(cfg), done)
-
-
-def _is_sweep(text: str) -> bool:
-    return OverridesParser.create().parse_overrides([text])[0].is_sweep_override()
 
 
 def _table(counts: Sequence[SweepCount]) -> Table:

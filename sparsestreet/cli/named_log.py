@@ -7,7 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.auto import AUTO, with_found_data
-from sparsestreet.cli.compose import composed, override_problem
+from sparsestreet.cli.compose import as_typed, composed, override_problem
 from sparsestreet.cli.targets import made
 from sparsestreet.data.reader import LogReader
 
@@ -29,7 +29,7 @@ def configured_log(
 
     Raises UsageError.
     """
-    words = list(overrides)
+    words = as_typed(list(overrides))
     if not any(text.startswith("data=") for text in words):
         words = [AUTO, *words]
     if AUTO in words and folder is None and not any(text.startswith("data.root=") for text in words):

@@ -1,5 +1,6 @@
 """What conf/ may ask for in ``${name:...}``."""
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,10 @@ from sparsestreet.records.summary import SUMMARY
 
 PER_IMAGE = 56.0
 """Steps for each training image of a recorded drive (docs/length.md)."""
+UNCOUNTED = "that run has no record"
+"""What is said of a control whose run is not there yet."""
+_LONGEST = 40
+"""Letters of a value in a folder's name."""
 IMAGES_PER_CAPACITY = 54.0
 """Training images of a recorded drive that the numbers of ``capacity=small`` are made for (docs/length.md)."""
 
@@ -122,9 +127,7 @@ def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> An
     if run is None:
         return otherwise
     if not SUMMARY.exists(Path(run)):
-        raise FileNotFoundError(
-            f"count_of={run}: that run has no record, and a control has its count from it; make it first"
-        )
+        raise FileNotFoundError(f"count_of={run}: {UNCOUNTED}, and a control has its count from it; make it first")
     gaussians = SUMMARY.read(Path(run)).gaussians
     return DictConfig(gaussians) if node is None else gaussians[node]
 
@@ -177,7 +180,30 @@ def last_part(path: str) -> str:
     return Path(path).name
 
 
+_TOLD = ("seed", "method", "sparsify", "assignment", "preset", "name", "out", "folder", "data", "sweep")
+"""Keys that are in a job's folder already, or tell its drive."""
+
+
+def swept(overrides: Iterable[str], fixed: Iterable[str]) -> str:
+    """Of conf/train.yaml: the options of a job that a sweep varies, for the name of its folder.
+
+    >>> swept(["seed=1", "pruning@callback.pruning.rule=volume", "a.keep=[0.5]", "a.b=3"], ["a.b"])
+    '_pruning=volume_keep=0.5'
+    """
+    words = ""
+    for text in overrides:
+        key, _, value = text.lstrip("+~").partition("=")
+        group = key.partition("@")[0]
+        if key in fixed or group in _TOLD or key.startswith(("data.", "hydra")):
+            continue
+        name = group.rpartition("/")[2].rpartition(".")[2]
+        plain = re.sub(r"[^\w.+-]+", "-", value).strip("-")
+        words += f"_{name}={plain[:_LONGEST]}"
+    return words
+
+
 _RESOLVERS = {
+    "swept": swept,
     "by_capacity": by_capacity,
     "as_published": as_published,
     "limit": limit,

@@ -10,7 +10,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.compose import configuration, load_run_config, without_flags
+from sparsestreet.cli.compose import configuration, load_run_config, quoted, value_of, without_flags
 from sparsestreet.cli.targets import check_modules, check_places, check_received, leaves
 from sparsestreet.records.branch_of import moment_of
 from sparsestreet.safe_yaml import read_yaml
@@ -31,8 +31,8 @@ def resumed_overrides(arguments: list[str], parts: Sequence[str] = ()) -> list[s
 
     Raises FileNotFoundError where no run is at that place, ValueError in a sweep, and for what is not to be trusted.
     """
-    given = next((text.partition("=")[2] for text in arguments if text.startswith("resume=")), "null")
-    if given in ("null", ""):
+    given = next((value_of(text) for text in arguments if text.startswith("resume=")), "null")
+    if given in ("null", "None", ""):
         return arguments
     if {"-m", "--multirun"} & set(arguments):
         raise ValueError("a sweep cannot go on with one run: leave out -m or resume")
@@ -50,7 +50,7 @@ def resumed_overrides(arguments: list[str], parts: Sequence[str] = ()) -> list[s
     own = {"resume", "out", "overwrite", *(_key_of(text) for text in arguments)}
     kept = [text for text in map(str, overrides) if _key_of(text) not in own]
     branches = moment_of(Path(given)) is not None
-    folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={run}"]
+    folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={quoted(str(run))}"]
     _check_words(kept, without_flags([*arguments, *folder]), source, parts)
     return [*kept, *arguments, *folder]
 

@@ -4,20 +4,24 @@ import logging
 import math
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from hydra import compose
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, InstantiationException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.compose import configuration, resolved, without_flags
+from sparsestreet.cli.compose import configuration, resolved, value_of, without_flags
 from sparsestreet.cli.flags import SHOWS, SWEEPS, flags_of
 from sparsestreet.cli.folder import folder_problem, holds_same_run, is_whole, same_run
 from sparsestreet.cli.locks import FolderTakenError
+from sparsestreet.cli.resolvers import UNCOUNTED
 from sparsestreet.cli.signals import beside_each_other, end_with_jobs
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
@@ -26,6 +30,13 @@ from sparsestreet.records.summary import SUMMARY
 
 log = logging.getLogger(__name__)
 
+_FIXED = "hydra.job.config.override_dirname.exclude_keys"
+_ALIKE = ("seed=", "data.root=")
+"""Options of a job that no problem of its configuration depends on."""
+_SAID = 10
+"""Configurations from which on a sweep says that it looks at them: a second each."""
+_OTHER_SWEEPERS = ("hydra/sweeper=", "hydra.sweeper.")
+"""Sweepers of somebody else's choose their jobs as they go."""
 OF_DRIVES = ("table", "drives")
 """What the names of sweeps over recorded drives start with."""
 
@@ -48,6 +59,62 @@ def as_sweep(arguments: list[str]) -> list[str]:
     return arguments if flagged or not _named(arguments) else ["-m", *arguments]
 
 
+def with_fixed_keys(arguments: list[str]) -> list[str]:
+    """The arguments of a sweep, with the keys that it does not vary for the names of its folders (``swept``)."""
+    if not SWEEPS & flags_of(arguments):
+        return arguments
+    fixed = [text.lstrip("+~").partition("=")[0] for text in without_flags(arguments) if not is_sweep(text)]
+    keys = ",".join(f"'{key}'" for key in fixed if not key.startswith("hydra"))
+    return [*arguments, f"{_FIXED}=[{keys}]"]
+
+
+def jobs_of(overrides: Sequence[str]) -> Iterator[list[str]]:
+    """The overrides of each job of a sweep, in Hydra's order. Hydra must know where conf/ lies.
+
+    Raises what Hydra raises for options that do not compose.
+    """
+    given = [text for text in overrides if not is_sweep(text)]
+    params = compose("train", given, return_hydra_config=True).hydra.sweeper.params or {}
+    asked = OverridesParser.create().parse_overrides([*(f"{key}={value}" for key, value in params.items()), *overrides])
+    for batch in BasicSweeper.split_arguments(asked, max_batch_size=None):
+        yield from batch
+
+
+def job_problem(arguments: list[str]) -> str | None:
+    """The first job of a sweep that cannot be, in one sentence; None where each can.
+
+    Each configuration is looked at once, whatever its seeds. What follows from a run that is not there yet passes.
+    """
+    if not SWEEPS & flags_of(arguments) or any(key in text for text in arguments for key in _OTHER_SWEEPERS):
+        return None
+    from sparsestreet.cli.assemble import recipe_of
+    from sparsestreet.cli.checks import config_problem
+
+    with configuration():
+        jobs = list(jobs_of(without_flags(arguments)))
+        once = {tuple(word for word in words if not word.startswith(_ALIKE)): words for words in reversed(jobs)}
+        if len(once) > _SAID:
+            print(f"sparsestreet train: looks at {len(once)} configurations before the first run", file=sys.stderr)
+        for words in reversed(once.values()):
+            try:
+                cfg = compose("train", [*words, "folder=."])
+                problem = config_problem(cfg)
+                if problem is None:
+                    recipe_of(cfg)
+            except (HydraException, OmegaConfBaseException, ValueError, ImportError, FileNotFoundError) as error:
+                problem = sentence(error).splitlines()[0]
+            if problem and UNCOUNTED not in problem:
+                shown = " ".join(word for word in words if not word.startswith("hydra"))
+                number = jobs.index(words) + 1
+                return f"job {number} of {len(jobs)} ({shown}): {problem}; nothing was trained"
+    return None
+
+
+def is_sweep(text: str) -> bool:
+    """Whether an override asks for several jobs. Raises OverrideParseException for one that cannot be read."""
+    return OverridesParser.create().parse_overrides([text])[0].is_sweep_override()
+
+
 def note_of_sweep(arguments: list[str]) -> str | None:
     """Where the configuration of a named sweep is shown: the keys whose values are not yet those of its jobs."""
     name = _named(arguments)
@@ -64,12 +131,12 @@ def sweep_problem(arguments: list[str]) -> str | None:
     name = _named(arguments)
     if name is None or not name.startswith(OF_DRIVES):
         return None
-    roots = next((text.partition("=")[2] for text in arguments if text.startswith("data.root=")), None)
+    roots = next((value_of(text) for text in arguments if text.startswith("data.root=")), None)
     if roots is None:
         return (
             f"+sweep={name} trains on recorded drives: give their folders, data.root=DIR,DIR (conf/sweep/{name}.yaml)"
         )
-    absent = [root for root in roots.split(",") if not Path(root).is_dir()]
+    absent = [root for root in ([roots] if Path(roots).is_dir() else roots.split(",")) if not Path(root).is_dir()]
     if absent:
         return f"data.root names {', '.join(absent)}, which is no folder here: give drives in DriveStudio's layout"
     return None

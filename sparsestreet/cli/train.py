@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.branch import check_resumed
-from sparsestreet.cli.compose import CONF, composed, override_problem, resolved, without_flags
+from sparsestreet.cli.compose import CONF, as_typed, composed, override_problem, resolved, without_flags
 from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
@@ -23,7 +23,17 @@ from sparsestreet.cli.process import follows_another, name_beside_first, speak_a
 from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
-from sparsestreet.cli.sweep import SweepFolder, as_sweep, note_of_sweep, run_job, sentence, sweep_problem, sweep_status
+from sparsestreet.cli.sweep import (
+    SweepFolder,
+    as_sweep,
+    job_problem,
+    note_of_sweep,
+    run_job,
+    sentence,
+    sweep_problem,
+    sweep_status,
+    with_fixed_keys,
+)
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -41,12 +51,14 @@ def train(arguments: list[str]) -> int:
             parts, arguments = _without_parts(arguments)
             problem = flag_problem(arguments)
             if problem is None:
+                arguments = as_typed(arguments)
                 arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments), parts))
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
                 arguments = as_sweep(arguments)
                 problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
-                arguments = _shown(arguments)
+                problem = problem or job_problem(arguments)
+                arguments = _shown(with_fixed_keys(arguments))
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
         if problem:

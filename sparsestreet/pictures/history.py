@@ -9,6 +9,7 @@ from sparsestreet.pictures.plots import plot_counts, plot_psnr
 from sparsestreet.records.held_out import HELD_OUT_CURVE
 from sparsestreet.records.ledger import LEDGER, MASK, PRUNING, CountChange
 from sparsestreet.records.logged import LOGGED
+from sparsestreet.records.run import RUN
 
 MARKED = (MASK, PRUNING)
 """Reasons of the changes that the curves mark."""
@@ -16,6 +17,8 @@ MARKED = (MASK, PRUNING)
 PSNR_COLUMNS = {"training, running mean": "psnr", "held out": "val/psnr"}
 """Curve -> its column in ``curves/metrics.csv``."""
 
+
+_NOT_HELD_OUT = "PSNR over training (no look at held-out views: trainer.val_check_interval, split.stride)"
 
 HELD_OUT_COLUMNS = {"full image": "psnr_full", "humans": "psnr_human", "vehicles": "psnr_vehicle"}
 """Curve -> its column in ``curves/held_out.csv``."""
@@ -30,15 +33,24 @@ def draw_history(run: Path) -> None:
     changes = LEDGER.find(run)
     events = marks(changes or ())
     if changes is not None:
-        steps, counts = count_curves(changes)
+        steps, counts = _to_the_end(*count_curves(changes), run)
         plot_counts(run / "curves" / "counts.png", steps, counts, events)
     curves = psnr_curves(LOGGED.rows(run), PSNR_COLUMNS, "step")
     if curves:
-        plot_psnr(run / "curves" / "psnr.png", curves, events)
+        title = "PSNR over training" if "held out" in curves else _NOT_HELD_OUT
+        plot_psnr(run / "curves" / "psnr.png", curves, events, title)
     curves = psnr_curves([asdict(look) for look in HELD_OUT_CURVE.find(run) or ()], HELD_OUT_COLUMNS, "seconds")
     if curves:
         title = "Held-out PSNR over training time, without evaluation"
         plot_psnr(run / "curves" / "held_out.png", curves, (), title, "seconds")
+
+
+def _to_the_end(steps: list[int], counts: dict[str, list[int]], run: Path) -> tuple[list[int], dict[str, list[int]]]:
+    """Returns the curves with the run's last step, at which nothing need have changed."""
+    known = RUN.find(run)
+    if known is None or not steps or known.steps <= steps[-1]:
+        return steps, counts
+    return [*steps, known.steps], {name: [*series, series[-1]] for name, series in counts.items()}
 
 
 def count_curves(changes: Sequence[CountChange]) -> tuple[list[int], dict[str, list[int]]]:

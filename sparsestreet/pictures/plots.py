@@ -7,12 +7,14 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 # Okabe and Ito's palette: distinguishable with any color vision.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-_MARKERS = "osD^vP*X"
+_MARKERS = "osD^vP*"  # one fewer than colors, so that pairs of both repeat late
 _DASHES = ("--", ":", "-.")
+_FEW_DECADES = 300
+"""Ratio of the ends of an axis below which 2 and 5 times a power of ten have labels."""
 
 
 def plot_counts(
@@ -42,7 +44,12 @@ def plot_counts(
         axes.plot(*samples, label=label, drawstyle="steps-post", **_line(index))
     _mark(axes, events)
     axes.set_yscale("log")
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    labels = FuncFormatter(lambda value, _: _short(value))
+    axes.yaxis.set_major_formatter(labels)
+    low, high = axes.get_ylim()
+    # Within a decade or two the powers of ten are too few to read a count by.
+    axes.yaxis.set_minor_formatter(labels if high < _FEW_DECADES * low else NullFormatter())
+    axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     _finish(figure, axes, path)
 
 

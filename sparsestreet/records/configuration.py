@@ -6,6 +6,7 @@ Keys are dotted (``schedule.max_steps``), values are JSON scalars or lists.
 import hashlib
 import json
 import math
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from fnmatch import fnmatchcase
 from typing import Any
@@ -146,6 +147,25 @@ def given_keys(commands: Iterable[str]) -> set[str]:
     ['loss.depth', 'method']
     """
     return {word.partition("=")[0].lstrip("+") for command in commands for word in command.split() if "=" in word}
+
+
+def chosen_options(command: str) -> dict[str, str]:
+    """Returns the choices of groups that a command gives: the group, with its place where it has one -> the option.
+
+    >>> chosen_options("sparsestreet train -m pruning@callback.pruning.rule=volume render=fast seed=0 a.b=1")
+    {'pruning@callback.pruning.rule': 'volume', 'render': 'fast', 'seed': '0'}
+    """
+    words = (word.partition("=") for word in _words(command))
+    given = ((key.lstrip("+"), equals, value) for key, equals, value in words)
+    # A group has no dot of its own; what stands behind an @ is its place.
+    return {key: value for key, equals, value in given if equals and "." not in key.partition("@")[0]}
+
+
+def _words(command: str) -> list[str]:
+    try:
+        return shlex.split(command)
+    except ValueError:  # a quote without its end, in a record that somebody wrote by hand
+        return command.split()
 
 
 def key_of(option: str) -> str:

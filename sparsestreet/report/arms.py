@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from sparsestreet.records.configuration import config_hash, differing_options, only, without
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.collect import RunRecord
+from sparsestreet.report.notes import BUSY, CLOCKS, busy_note
 from sparsestreet.report.variants import CLIP_KEYS, control_of, in_few_words, log_config, variants
 
 Value = Callable[[RunSummary], float | None]
@@ -76,6 +77,15 @@ class Arm:
     def mean(self, value: Value, whole: bool = False) -> float | None:
         """Returns the mean over scenes of the mean over each scene's seeds; None if no run has the value."""
         return mean_over_scenes(self.units(value, whole))
+
+    def busy(self, clock: str) -> str:
+        """Returns the mark of times, of "frames" or of "training", if a machine was not quiet; else an empty text."""
+        return "" if all(CLOCKS[clock](record.summary) for record in self.records) else BUSY
+
+
+def busy_arms(found: Iterable[Arm]) -> list[str]:
+    """Returns a note that names the arms with times of a machine that was not quiet, or nothing."""
+    return busy_note((arm.name, record.summary) for arm in found for record in arm.records)
 
 
 def unit_of(run: RunSummary) -> Unit:

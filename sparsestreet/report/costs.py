@@ -4,9 +4,12 @@ import statistics
 from collections.abc import Callable, Sequence
 
 from sparsestreet.records.costs import COSTS, PRUNE, CostRecord
-from sparsestreet.report.arms import Arm
+from sparsestreet.report.arms import Arm, busy_arms
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.grid import Cell, Grid, number_cell
+
+_CLOCK_OF = {"ms/frame": "frames", "train s": "training"} | dict.fromkeys(("seconds", "ms of a step"), "training")
+"""Heading, or shared heading, of a column of times -> what its machine was measured with."""
 
 _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] = (
     ("", "Gaussians", "{:,.0f}", lambda record: float(record.summary.gaussians_total)),
@@ -29,16 +32,19 @@ def what_arms_cost(arms: Sequence[Arm]) -> Grid:
     rows = []
     for arm in arms:
         runs = tuple(record.folder.name for record in arm.records)
-        cells = [number_cell(_mean(arm, value), form, runs) for _, _, form, value in shown]
+        clocks = [_CLOCK_OF.get(group or heading) for group, heading, _, _ in shown]
+        marks = [arm.busy(clock) if clock else "" for clock in clocks]
+        cells = [
+            number_cell(_mean(arm, value), form, runs, mark)
+            for (_, _, form, value), mark in zip(shown, marks, strict=True)
+        ]
         rows.append((Cell(arm.title, runs=runs), Cell(str(len(runs)), runs=runs), *cells))
     header = (("", "arm"), ("", "n"), *((group, heading) for group, heading, _, _ in shown))
     notes = [
         "means over the runs of an arm; train s: steps and pruning, without evaluation; whole command: from the import "
         "of torch to the pictures; a step: medians over the steps that records/phases.csv notes"
     ]
-    if not all(record.summary.latency.noise.quiet for arm in arms for record in arm.records):
-        notes.append("some milliseconds are of a machine that was not quiet, as their records say")
-    return Grid("costs", "What each arm costs", header, tuple(rows), tuple(notes))
+    return Grid("costs", "What each arm costs", header, tuple(rows), (*notes, *busy_arms(arms)))
 
 
 def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float | None:

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.report.arms import Arm, Unit, plain_of
+from sparsestreet.report.arms import Arm, Unit, busy_arms, plain_of
 from sparsestreet.report.grid import Cell, Grid
 
 BELOW = (1.0, 0.5, 0.1)
@@ -70,7 +70,8 @@ def time_to_quality(arms: Sequence[Arm]) -> Grid | None:
         if plain is None or not curves[arm.name]:
             continue
         runs = tuple(record.folder.name for record in arm.records)
-        cells = [Cell(_reached(curves[arm.name], curves[plain.name], below), runs=runs) for below in BELOW]
+        times = [_reached(curves[arm.name], curves[plain.name], below) for below in BELOW]
+        cells = [Cell(f"{time} {arm.busy('training') if ' s' in time else ''}".rstrip(), runs=runs) for time in times]
         rows.append((Cell(arm.title, runs=runs), *cells))
     header = (("", "arm"), *(("", f"base - {below:g} dB") for below in BELOW))
     notes = (
@@ -78,7 +79,7 @@ def time_to_quality(arms: Sequence[Arm]) -> Grid | None:
         "runs that get there; base: the last look of the plain run of the same scene and seed",
         "a look is a fixed probe of held-out views; nothing is interpolated between two looks",
     )
-    return Grid("time_to_quality", "Time to quality", header, tuple(rows), notes)
+    return Grid("time_to_quality", "Time to quality", header, tuple(rows), (*notes, *busy_arms(arms)))
 
 
 def _reached(ours: dict[Unit, QualityCurve], plain: dict[Unit, QualityCurve], below: float) -> str:

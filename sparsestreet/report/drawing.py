@@ -9,7 +9,7 @@ from rich.text import Text
 from sparsestreet.pictures.plots import plot_runs
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.notes import CAPPED
+from sparsestreet.report.notes import BUSY, CAPPED
 from sparsestreet.report.quantities import Quantity
 from sparsestreet.report.sections import Row, Section
 from sparsestreet.report.spread import Spread
@@ -110,13 +110,18 @@ def _lines(section: Section) -> list[list[str]]:
 
 
 def _texts(row: Row, quantities: Sequence[Quantity]) -> list[str]:
-    return [row.label, row.runs, *(_cell(cell, one, row) for cell, one in zip(row.cells, quantities, strict=True))]
+    busy = row.busy or (False,) * len(quantities)
+    cells = [_cell(*one, row) for one in zip(row.cells, quantities, busy, strict=True)]
+    return [row.label, row.runs, *cells]
 
 
-def _cell(cell: Spread | None, quantity: Quantity, row: Row) -> str:
-    """Returns mean ± sd, a mark if a cap limited the count, and n if it differs from the row's."""
+def _cell(cell: Spread | None, quantity: Quantity, busy: bool, row: Row) -> str:
+    """Returns mean ± sd, marks of a count that a cap limited and of a time of a busy machine, and n if it differs.
+
+    A difference holds no time of a busy machine: it has the mark alone where nothing else is left.
+    """
     if cell is None:
-        return ABSENT
+        return BUSY if busy else ABSENT
     percentage = row.difference and quantity.relative
     number = "{:.1f}".format if percentage else quantity.text
     sign = "" if not row.difference or percentage else "+" if cell.mean >= 0 else "-"
@@ -125,4 +130,5 @@ def _cell(cell: Spread | None, quantity: Quantity, row: Row) -> str:
         text += f" ± {number(cell.sd)}"
     text += " %" if percentage else ""
     text += f" {CAPPED}" if row.capped and quantity.count else ""
+    text += f" {BUSY}" if busy and not row.difference else ""
     return text if cell.n == row.n else f"{text} (n={cell.n})"

@@ -3,12 +3,15 @@
 import io
 import re
 import statistics
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -20,11 +23,17 @@ from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
 
+T = TypeVar("T")
+
 # Okabe and Ito's palette with a slightly lighter blue: distinguishable with any color vision, on white and on black.
-COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+# The last four are for the seventh arm and on.
+COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7a5195", "#8c564b", "#5c6f1c", "#b3003c")
 GREY = "#8c8c8c"
 _MARKERS = {"none": "o", "paper": "s", "paper_short": "s", "removal": "D", "masks": "^", "importance": "v"}
 _MARKERS |= {"random": "x", "opacity": "+"}
+_SPARE = "P^vX*<>phd8H"
+"""Markers of other arms, in turn."""
+_DASHES = ("-", "--", ":", "-.")
 _INK = "#010203"
 """Stands for the color of the page's text."""
 
@@ -102,16 +111,67 @@ def _titled(svg: str, name: str, texts: Sequence[str]) -> str:
     return f"{head}<g>{tail}{behind}{rest_of_figure}"
 
 
-def colors(arms: Sequence[Arm]) -> dict[str, str]:
-    """Returns label of a plain method -> its color."""
-    labels = list(dict.fromkeys(arm.plain_label for arm in arms))
-    return {label: COLORS[index % len(COLORS)] for index, label in enumerate(labels)}
+@dataclass(frozen=True)
+class Style:
+    """How an arm is drawn. Two arms of a figure differ in it."""
+
+    kind: str
+    """What the arm is beside its method: its sparsification, or all that its name says where that is of several."""
+    method: str
+    """Color of the arm's method; grey for a control."""
+    color: str
+    """Color of its kind, for figures or panels of one method; grey for a control."""
+    marker: str
+    dashes: str
 
 
-def of_sparsify(arm: Arm) -> str:
-    """Returns the color of an arm's sparsification, for figures of one method."""
+def styles(arms: Sequence[Arm]) -> dict[str, Style]:
+    """Returns name of an arm -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
+    methods, kinds = list(dict.fromkeys(arm.plain_label for arm in arms)), _kinds(arms)
+    every = list(dict.fromkeys(kinds.values()))
     known = {"none": 0, "paper": 1, "paper_short": 1, "removal": 2, "masks": 3, "importance": 4}
-    return COLORS[known.get(arm.sparsify, 5)]
+    colored = _in_turn(every, known, range(len(COLORS)))
+    marked = _in_turn(every, _MARKERS, _SPARE)
+    found = {}
+    for arm in arms:
+        kind = kinds[arm.name]
+        own = {"capped": ":", "random": "--", "opacity": "-."}.get(kind)
+        dashes = own or _DASHES[every.index(kind) // len(COLORS) % len(_DASHES)]
+        if arm.control and not own:
+            dashes = _DASHES[every.index(kind) % len(_DASHES)]
+        method = COLORS[methods.index(arm.plain_label) % len(COLORS)]
+        paints = (GREY, GREY) if arm.control else (method, COLORS[colored[kind]])
+        found[arm.name] = Style(_in_legend(arm, kind), *paints, marked[kind], dashes)
+    return found
+
+
+def _kinds(arms: Sequence[Arm]) -> dict[str, str]:
+    """Returns name of an arm -> its sparsification, or all that its name says beside its method."""
+    of_method = Counter((arm.plain_label, arm.sparsify) for arm in arms)
+    several = {sparsify for (_, sparsify), number in of_method.items() if number > 1}
+    return {
+        arm.name: (arm.name.removeprefix(arm.plain_label).strip(" +") or arm.sparsify)
+        if arm.sparsify in several
+        else arm.sparsify
+        for arm in arms
+    }
+
+
+def _in_turn(kinds: Sequence[str], known: Mapping[str, T], spare: Sequence[T]) -> dict[str, T]:
+    """Returns kind -> the value that it is known by, or the next that no other has; in turn where all are taken."""
+    found: dict[str, T] = {}
+    for kind in kinds:
+        if kind in known and known[kind] not in found.values():
+            found[kind] = known[kind]
+    left = [one for one in spare if one not in found.values()] or list(spare)
+    others = [kind for kind in kinds if kind not in found]
+    return found | {kind: left[index % len(left)] for index, kind in enumerate(others)}
+
+
+def _in_legend(arm: Arm, kind: str) -> str:
+    if arm.control:
+        return f"control: {kind}"
+    return "plain" if kind == "none" else f"plain {kind}" if arm.sparsify == "none" else kind
 
 
 def short(value: float) -> str:
@@ -122,11 +182,6 @@ def short(value: float) -> str:
     """
     unit, size = next(((unit, size) for unit, size in (("M", 1e6), ("k", 1e3)) if value >= size), ("", 1.0))
     return f"{value / size:g}{unit}"
-
-
-def marker(arm: Arm) -> str:
-    """Returns the marker of an arm's sparsification."""
-    return _MARKERS.get(arm.sparsify, "P")
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -161,7 +216,7 @@ def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value]
         one.set_xlabel(cost[1])
         if index == 0:
             one.set_ylabel("held-out PSNR, dB")
-    figure.legend(handles=_legend(arms), loc="outside lower center", ncols=4, **LEGEND)
+    legend_below(figure, _legend(arms))
     write_svg(figure, path, says)
     return True
 
@@ -171,29 +226,29 @@ def _held_out(metric: str) -> Value:
 
 
 def _pareto_panel(axes: Axes, arms: Sequence[Arm], of: tuple[str, str, Value], quality: Value, region: str) -> Says:
-    color = colors(arms)
+    style = styles(arms)
     cost, unit = of[2], of[1]
     means: dict[str, tuple[float, float]] = {}
     says: Says = {}
     for number, arm in enumerate(arms):
-        paint = GREY if arm.control else color[arm.plain_label]
+        paint, marker = _paint(style, arm), style[arm.name].marker
         points = _points(arm, cost, quality)
         if not points:
             continue
-        axes.scatter(*zip(*points.values(), strict=True), s=9, alpha=0.45, color=paint, marker=marker(arm),
+        axes.scatter(*zip(*points.values(), strict=True), s=9, alpha=0.45, color=paint, marker=marker,
                      linewidths=0.8, gid=(runs := f"{region} {number} runs"))  # fmt: skip
         means[arm.name] = _mean_point(points)
         says[runs] = [f"{arm.name}, {scene}, seed {seed}: {_in_words(point, unit)}"
                       for ((scene, _), seed), point in points.items()]  # fmt: skip
         says[f"{region} {number} mean"] = [f"{arm.title}, mean: {_in_words(means[arm.name], unit)}"]
         # A marker of lines has no inside to leave empty: it is drawn thin.
-        hollow = {"facecolors": "none", "edgecolors": paint} if marker(arm) not in "x+" else {"color": paint}
+        hollow = {"facecolors": "none", "edgecolors": paint} if marker not in "x+" else {"color": paint}
         shape = {**hollow, "linewidths": 0.8} if arm.lacks else {"color": paint, "linewidths": 1.6}
-        axes.scatter(*means[arm.name], s=48, marker=marker(arm), zorder=3, gid=f"{region} {number} mean", **shape)
+        axes.scatter(*means[arm.name], s=48, marker=marker, zorder=3, gid=f"{region} {number} mean", **shape)
     for arm in arms:
         ends = None if arm.control else paired_means(arm, plain_of(arm, arms), cost, quality)
         if ends is not None:
-            arrow = {"arrowstyle": "->", "color": color[arm.plain_label], "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
+            arrow = {"arrowstyle": "->", "color": _paint(style, arm), "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
             axes.annotate("", ends[1], ends[0], arrowprops=arrow)
     best = front([means[arm.name] for arm in arms if arm.name in means and not arm.control and not arm.lacks])
     if best:
@@ -204,6 +259,21 @@ def _pareto_panel(axes: Axes, arms: Sequence[Arm], of: tuple[str, str, Value], q
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
     return says
+
+
+def _paint(style: Mapping[str, Style], arm: Arm) -> str:
+    """Returns the color of the method, or of the kind if there is one method."""
+    own = style[arm.name]
+    return own.color if len({one.method for one in style.values()} - {GREY}) <= 1 else own.method
+
+
+def legend_below(figure: Figure, handles: Sequence[Artist]) -> None:
+    """Adds a legend below the panels, in as many columns as its longest name lets fit; its further rows add height."""
+    longest = max(len(str(handle.get_label())) for handle in handles)
+    columns = max(1, min(4, int(figure.get_figwidth() / (0.4 + 0.065 * longest))))
+    rows = -(-len(handles) // columns)
+    figure.set_figheight(figure.get_figheight() + 0.17 * max(rows - 2, 0))
+    figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, **LEGEND)
 
 
 def _in_words(point: tuple[float, float], unit: str) -> str:
@@ -242,18 +312,22 @@ def _mean_point(points: Mapping[Unit, tuple[float, float]]) -> tuple[float, floa
 
 
 def _legend(arms: Sequence[Arm]) -> list[Line2D]:
-    dots = [Line2D([], [], color=paint, marker="o", linestyle="", label=name) for name, paint in colors(arms).items()]
-    kinds = {arm.sparsify: arm for arm in arms}
+    style = styles(arms)
+    methods = {arm.plain_label: style[arm.name].method for arm in arms if not arm.control}
+    dots = [Line2D([], [], color=paint, marker="o", linestyle="", label=name) for name, paint in methods.items()]
+    # Of one method, the color is the kind's.
+    dots, alone = (dots, False) if len(methods) > 1 else ([], True)
+    kinds = {style[arm.name].kind: arm for arm in arms}
     shapes = [
         Line2D(
             [],
             [],
-            color=GREY if arm.control else _INK,
-            marker=marker(arm),
+            color=GREY if arm.control else style[arm.name].color if alone else _INK,
+            marker=style[arm.name].marker,
             linestyle="",
             markerfacecolor="none",
-            label=f"control: {name}" if arm.control else {"none": "plain"}.get(name, name),
+            label=kind,
         )
-        for name, arm in kinds.items()
+        for kind, arm in kinds.items()
     ]
     return [*dots, *shapes, Line2D([], [], color=_INK, linestyle="--", linewidth=0.9, label="front of the means")]

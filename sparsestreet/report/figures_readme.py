@@ -12,9 +12,9 @@ from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Value, by_scene
 from sparsestreet.report.curves import curves_of, mean_curve
-from sparsestreet.report.figures import LEGEND, colors, marker, of_sparsify, panels
+from sparsestreet.report.figures import legend_below, panels, styles
 
-_DASHES = {"none": "-", "paper": "--", "paper_short": "--", "removal": ":"}
+_DASHES = {"plain": "-", "paper": "--", "paper_short": "--", "removal": ":"}
 
 
 def time_figure(arms: Sequence[Arm], protocol: Protocol, path: Path) -> None:
@@ -33,8 +33,7 @@ def time_figure(arms: Sequence[Arm], protocol: Protocol, path: Path) -> None:
     training.set_xlabel("training seconds")
     frame.set_xlabel("milliseconds a frame")
     training.set_ylabel("held-out PSNR, dB")
-    handles, names = training.get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=4, **LEGEND)
+    legend_below(figure, training.get_legend_handles_labels()[0])
     FigureCanvasAgg(figure)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150, facecolor="white", metadata={"Software": None})
@@ -50,17 +49,19 @@ def _over_training(axes: Axes, arm: Arm, shown: Sequence[Arm], protocol: Protoco
         _points(axes, arm, shown, _seconds, protocol)
         return
     mean = mean_curve(curves)
-    dashes, end = _DASHES.get(arm.sparsify, "-."), [len(mean.seconds) - 1]
+    look, end = styles(shown)[arm.name], [len(mean.seconds) - 1]
+    dashes = _DASHES.get(look.kind, "-.")
     paint = _paint(arm, shown)
     axes.plot(
-        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=marker(arm), markevery=end, label=arm.title
+        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(arm)
     )
 
 
 def _paint(arm: Arm, shown: Sequence[Arm]) -> str:
     """Returns the color of the arm's method, or of its sparsification if there is only one method."""
-    of_method = colors(shown)
-    return of_method[arm.plain_label] if len(of_method) > 1 else of_sparsify(arm)
+    look = styles(shown)
+    own = look[arm.name]
+    return own.method if len({one.method for one in look.values()}) > 1 else own.color
 
 
 def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: Protocol) -> None:
@@ -73,7 +74,11 @@ def _points(axes: Axes, arm: Arm, shown: Sequence[Arm], cost: Value, protocol: P
     axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
     scenes = (by_scene({unit: values[unit] for unit in units}) for values in (costs, qualities))
     x, y = (statistics.fmean(means.values()) for means in scenes)
-    axes.scatter(x, y, s=44, color=paint, marker=marker(arm), label=arm.title, zorder=3)
+    axes.scatter(x, y, s=44, color=paint, marker=styles(shown)[arm.name].marker, label=_label(arm), zorder=3)
+
+
+def _label(arm: Arm) -> str:
+    return f"{arm.title} (machine not quiet)" if arm.busy("frames") or arm.busy("training") else arm.title
 
 
 def _seconds(run: RunSummary) -> float | None:

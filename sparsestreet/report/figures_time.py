@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from sparsestreet.pictures.history import count_curves, marks
@@ -14,7 +15,21 @@ from sparsestreet.records.costs import COSTS
 from sparsestreet.records.ledger import LEDGER
 from sparsestreet.report.arms import Arm
 from sparsestreet.report.curves import curves_of_runs
-from sparsestreet.report.figures import COLORS, GREY, LEGEND, Says, of_sparsify, panels, short, write_svg
+from sparsestreet.report.figures import (
+    COLORS,
+    GREY,
+    LEGEND,
+    Says,
+    Style,
+    legend_below,
+    panels,
+    short,
+    styles,
+    write_svg,
+)
+
+_MOST_BESIDE_CURVES = 6
+"""Largest number of names in a legend that stands within a panel."""
 
 
 def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
@@ -26,15 +41,17 @@ def held_out_over_time(arms: Sequence[Arm], path: Path) -> bool:
     methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
     figure, axes = panels(len(methods))
     says: Says = {}
+    look = styles(arms)
     for one, method in zip(axes, methods, strict=True):
         for arm in _of(drawn, method):
             for curve in found[arm.name]:
                 name = f"curve {len(says)}"
-                one.plot(curve.seconds, curve.psnr, **_line(arm), marker=".", markersize=3, gid=name)
+                one.plot(curve.seconds, curve.psnr, **_line(look[arm.name]), marker=".", markersize=3, gid=name)
                 looks = zip(curve.seconds, curve.psnr, strict=True)
                 says[name] = [f"{arm.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
         _finish(one, method, "training seconds")
     axes[0].set_ylabel("held-out PSNR, dB")
+    _legends(figure, axes)
     write_svg(figure, path, says)
     return True
 
@@ -46,26 +63,28 @@ def counts_over_time(arms: Sequence[Arm], path: Path) -> bool:
         return False
     methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
     figure, axes = panels(len(methods))
+    look = styles(arms)
     for one, method in zip(axes, methods, strict=True):
         for arm in _of(drawn, method):
             for record in arm.records:
                 if LEDGER.exists(record.folder):
-                    _counts(one, arm, record.folder)
+                    _counts(one, look[arm.name], record.folder)
         one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
         _finish(one, method, "step")
     axes[0].set_ylabel("Gaussians")
+    _legends(figure, axes)
     write_svg(figure, path)
     return True
 
 
-def _counts(axes: Axes, arm: Arm, folder: Path) -> None:
+def _counts(axes: Axes, look: Style, folder: Path) -> None:
     changes = LEDGER.read(folder)
     steps, nodes = count_curves(changes)
     total = [sum(values) for values in zip(*nodes.values(), strict=True)]
-    axes.plot(steps, total, drawstyle="steps-post", **_line(arm))
+    axes.plot(steps, total, drawstyle="steps-post", **_line(look))
     at = dict(zip(steps, total, strict=True))
     taken = sorted({step for step, _ in marks(changes)})
-    axes.plot(taken, [at[step] for step in taken], ".", markersize=4, color=_line(arm)["color"], label="_")
+    axes.plot(taken, [at[step] for step in taken], ".", markersize=4, color=look.color, label="_")
 
 
 def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
@@ -75,7 +94,9 @@ def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
     if not drawn:
         return False
     parts = list(dict.fromkeys(part for arm in drawn for part in costs[arm.name]))
-    figure, (axes,) = panels(1, width=7.4, height=1.1 + 0.34 * len(drawn))
+    titles = [textwrap.wrap(arm.title, 40) for arm in drawn]
+    # A bar is as high as the most lines of a name, which would run into its neighbors'.
+    figure, (axes,) = panels(1, width=7.4, height=1.1 + max(0.34, 0.16 * max(map(len, titles)) + 0.08) * len(drawn))
     for row, arm in enumerate(drawn):
         left = 0.0
         for part, ms in costs[arm.name].items():
@@ -87,7 +108,7 @@ def frame_waterfall(arms: Sequence[Arm], path: Path) -> bool:
     for index, part in enumerate(parts):
         hatch = "//" if part.startswith("effect") else None
         axes.barh([0], [0], color=COLORS[index % len(COLORS)], hatch=hatch, edgecolor="white", label=part)
-    axes.set_yticks(range(len(drawn)), [textwrap.fill(arm.title, 40) for arm in drawn])
+    axes.set_yticks(range(len(drawn)), ["\n".join(lines) for lines in titles])
     axes.invert_yaxis()
     axes.axvline(0, color=GREY, linewidth=0.8)
     axes.set_xlabel("milliseconds that a frame takes longer with it")
@@ -110,16 +131,21 @@ def _of(arms: Sequence[Arm], method: str) -> list[Arm]:
     return [arm for arm in arms if arm.plain_label == method]
 
 
-def _line(arm: Arm) -> dict[str, Any]:
-    dashes = {"capped": ":", "random": "--", "opacity": "-."}.get(arm.sparsify, "-")
-    paint = GREY if arm.control else of_sparsify(arm)
-    name = f"control: {arm.sparsify}" if arm.control else {"none": "plain"}.get(arm.sparsify, arm.sparsify)
-    return {"color": paint, "linestyle": dashes, "linewidth": 1.2, "alpha": 0.85, "label": name}
+def _line(look: Style) -> dict[str, Any]:
+    return {"color": look.color, "linestyle": look.dashes, "linewidth": 1.2, "alpha": 0.85, "label": look.kind}
 
 
 def _finish(axes: Axes, title: str, x_label: str) -> None:
     axes.set_title(title, fontsize=10)
     axes.set_xlabel(x_label)
-    handles, names = axes.get_legend_handles_labels()
-    once = dict(zip(names, handles, strict=True))
-    axes.legend(once.values(), once.keys(), **LEGEND)
+
+
+def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Adds a legend to each panel, or one below all of them if it would hide the curves."""
+    named = [dict(zip(*reversed(one.get_legend_handles_labels()), strict=True)) for one in axes]
+    if max(map(len, named)) <= _MOST_BESIDE_CURVES:
+        for one, once in zip(axes, named, strict=True):
+            one.legend(once.values(), once.keys(), **LEGEND)
+        return
+    once = {name: handle for some in named for name, handle in some.items()}
+    legend_below(figure, list(once.values()))

@@ -23,13 +23,17 @@ class Cell:
     """The number before it was rounded, for whoever points at it on the page."""
 
 
-def number_cell(value: float | None, form: str, runs: tuple[str, ...]) -> Cell:
-    """Returns a rounded number with its exact value.
+def number_cell(value: float | None, form: str, runs: tuple[str, ...], mark: str = "") -> Cell:
+    """Returns a rounded number, with a mark if one is given, and its exact value.
 
     >>> number_cell(0.123456, "{:.2f}", ("run0",))
     Cell(text='0.12', bold=False, published=False, runs=('run0',), exact='0.123456')
     """
-    return Cell(runs=runs) if value is None else Cell(form.format(value), runs=runs, exact=f"{value:.8g}")
+    return (
+        Cell(runs=runs)
+        if value is None
+        else Cell(f"{form.format(value)} {mark}".rstrip(), runs=runs, exact=f"{value:.8g}")
+    )
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.failures import FailedRun
 from sparsestreet.records.quality import HELD_OUT, TRAINING
-from sparsestreet.report.arms import Arm, Value
+from sparsestreet.report.arms import Arm, Value, busy_arms
 from sparsestreet.report.beside import mean_beside
 from sparsestreet.report.grid import ABSENT, Cell, Grid
 from sparsestreet.report.published import LAYOUT, TABLES, Key, PublishedRow, PublishedTable
@@ -36,13 +36,21 @@ def paper_table(
     header = [("", "method"), ("", "n")]
     for key in table.columns:
         header += [(_GROUPS[key[0]], _heading(key)), (_GROUPS[key[0]], f"{_heading(key)}, paper")]
+    # The paper's columns stand where it has a number for one of our rows.
+    kept = [
+        index
+        for index, (_, heading) in enumerate(header)
+        if sweep in TABLES or not heading.endswith(", paper") or any(row[index].text != ABSENT for row in rows)
+    ]
+    header, rows = [header[index] for index in kept], [tuple(row[index] for index in kept) for row in rows]
+    beside = any(heading.endswith(", paper") for _, heading in header)
     of = f"Table {table.number} of the paper" if sweep in TABLES else "All arms, in the layout of the paper's Table 1"
     return Grid(
         "paper",
         f"{of}: {table.caption}" if sweep in TABLES else of,
         tuple(header),
         tuple(rows),
-        _notes(arms, table, protocol, sweep in TABLES, bool(failures)),
+        _notes(arms, table, protocol, sweep in TABLES, beside, bool(failures)),
     )
 
 
@@ -67,7 +75,8 @@ def _row(
         ours = _ours(arm, key, protocol) if arm else None
         theirs = published.get(key)
         exact = "" if ours is None else f"{ours:.8g}"
-        cells += [Cell(_text(ours, key), runs=runs, exact=exact), Cell(_text(theirs, key), published=True)]
+        busy = f" {arm.busy('frames')}".rstrip() if arm and key[2] == "fps" else ""
+        cells += [Cell(_text(ours, key) + busy, runs=runs, exact=exact), Cell(_text(theirs, key), published=True)]
     return tuple(cells)
 
 
@@ -121,11 +130,17 @@ def _failed(folder: Path, failure: FailedRun, width: int) -> tuple[Cell, ...]:
     return (name, *[Cell()] * (width - 1))
 
 
-def _notes(arms: Sequence[Arm], table: PublishedTable, protocol: Protocol, same: bool, failed: bool) -> tuple[str, ...]:
-    said = [
+def _notes(
+    arms: Sequence[Arm], table: PublishedTable, protocol: Protocol, same: bool, beside: bool, failed: bool
+) -> tuple[str, ...]:
+    published = [
         f"paper: published in Table {table.number}, of another implementation, clock and machine, "
         + ("on its drives" if same else "and of other data: to be read beside ours, not against it"),
-        f"published: {table.views}; protocol {protocol.name}: {', '.join(protocol.metrics)}",
+        f"published: {table.views}",
+    ]
+    said = [
+        *(published if beside else ()),
+        f"protocol {protocol.name}: {', '.join(protocol.metrics)}",
         "n: runs; a number is the mean over scenes of the mean over each one's seeds; "
         "FPS is 1000 / median milliseconds of a frame",
     ]
@@ -137,4 +152,4 @@ def _notes(arms: Sequence[Arm], table: PublishedTable, protocol: Protocol, same:
     said += [f"control {name}: {control}" for name, control in controls]
     if failed:
         said.append("failed runs are in no mean")
-    return tuple(said)
+    return (*said, *busy_arms(arms))

@@ -1,7 +1,7 @@
 """The notes below a table: how its numbers are defined, and where runs differ."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from sparsestreet.metrics.definitions import LIDAR_REACH
 from sparsestreet.metrics.protocols import Protocol
@@ -12,6 +12,30 @@ from sparsestreet.report.variants import Variant
 
 CAPPED = "†"
 """Marks counts that a node's ``max_gaussians`` limited."""
+BUSY = "§"
+"""Marks times that are of a machine that was not quiet, as the ``noise`` of their record says."""
+
+
+def frames_steady(run: RunSummary) -> bool:
+    """Return whether the machine was quiet while frames were timed."""
+    return run.latency.noise.quiet
+
+
+def training_steady(run: RunSummary) -> bool:
+    """Return whether the machine was quiet while the run trained; a record that does not say counts as quiet."""
+    return run.run.noise is None or run.run.noise.quiet
+
+
+CLOCKS: dict[str, Callable[[RunSummary], bool]] = {"frames": frames_steady, "training": training_steady}
+"""What is timed -> whether its times are of a quiet machine."""
+
+
+def busy_note(named: Iterable[tuple[str, RunSummary]]) -> list[str]:
+    """Return a note that names the rows with marked times, for (name of a row, run) pairs; nothing without any."""
+    named = list(named)
+    busy = {what: sorted({name for name, run in named if not steady(run)}) for what, steady in CLOCKS.items()}
+    said = [f"{what} of {', '.join(names)}" for what, names in busy.items() if names]
+    return [f"{BUSY} times of a machine that was not quiet, compared with no other: {'; '.join(said)}"] if said else []
 
 
 def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) -> list[str]:
@@ -22,6 +46,7 @@ def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) ->
         *_absent(runs, protocol),
         *_timing(runs),
         *_training(runs),
+        *busy_note((variant.name, run) for variant in variants for run in variant.runs),
         *(_scenes(variants) if over_scenes else ()),
         *_lacking_seeds(variants),
         *_long_names(variants),

@@ -9,6 +9,7 @@ from pathlib import Path
 from sparsestreet.records.failures import FailedRun
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.grid import ABSENT, Cell, Grid
+from sparsestreet.report.notes import frames_steady, training_steady
 
 _THEIRS = ", paper"
 """The end of a heading whose column has published numbers."""
@@ -191,11 +192,14 @@ def _run(record: RunRecord) -> str:
         "trained on": f"{run.device}, {run.threads} threads, {run.machine.system}, torch {run.machine.torch}",
         "scene": f"{run.scene}, seed {run.seed}, held out: {run.split}",
         "steps": f"{run.steps:,} of {run.max_steps:,}",
-        "training seconds": "-" if run.training_seconds is None else f"{run.training_seconds:.1f}",
+        "training seconds": "-"
+        if run.training_seconds is None
+        else f"{run.training_seconds:.1f}{_steady(training_steady(summary))}",
         "Gaussians": ", ".join(f"{name} {count:,}" for name, count in summary.gaussians.items()),
         "held down by a cap": ", ".join(f"{name} {cap:,}" for name, cap in run.caps.items()) or "none",
         "bytes": f"{summary.bytes_total:,}",
-        "ms a frame": f"{summary.latency.p50:.3f} ({summary.latency_protocol}; {summary.latency.device})",
+        "ms a frame": f"{summary.latency.p50:.3f} ({summary.latency_protocol}; {summary.latency.device}"
+        f"{_steady(frames_steady(summary))})",
         "guards": ", ".join(f"{name} {count:,}" for name, count in summary.guards.alarms.items()) or "none fired",
     } | metrics
     lines = "".join(f"<dt>{escape(key)}</dt><dd>{escape(value)}</dd>" for key, value in said.items())
@@ -204,6 +208,10 @@ def _run(record: RunRecord) -> str:
         f"<details id='run-{name}'><summary>{name}</summary><p>records/summary.json of this run; "
         f"<a href='#config-{run.config_hash}'>configuration {run.config_hash}</a></p><dl>{lines}</dl></details>"
     )
+
+
+def _steady(steady: bool) -> str:
+    return "" if steady else ", on a machine that was not quiet"
 
 
 def _configurations(records: Sequence[RunRecord]) -> list[str]:

@@ -9,6 +9,7 @@ from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report.arms import Arm, Unit, mean_over_scenes
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.grid import Cell, Grid, number_cell
+from sparsestreet.report.notes import BUSY
 from sparsestreet.report.tradeoffs import difference_cell, interval_over_scenes
 
 Number = Callable[[RenderedAs], float | None]
@@ -40,8 +41,8 @@ def rendered_otherwise(arms: Sequence[Arm], protocol: Protocol) -> Grid | None:
         "one scene, the same held-out views; dB to exact: of the image against that of the same scene without cut-off "
         "and early stop; differences paired by scene and seed, with 95 % t intervals, bold where they exclude 0"
     ]
-    if not all(record.noise.quiet for _, records in recorded for some in records.values() for record in some):
-        notes.append("milliseconds of a machine that was not quiet")
+    if busy := [arm.name for arm, records in recorded if _busy(records)]:
+        notes.append(f"{BUSY} times of a machine that was not quiet, compared with no other: {', '.join(busy)}")
     return Grid("presets", "Trained one way, rendered another", tuple(header), tuple(rows), tuple(notes))
 
 
@@ -77,9 +78,15 @@ def _rows(arm: Arm, records: Records, protocol: Protocol, several: bool) -> Iter
         cells = [Cell(title, runs=runs), Cell(name, runs=runs), Cell(str(len(found)), runs=runs)]
         for metric in metrics:
             cells += _quality(found, trained, metric, runs)
-        for _, _, form, number in _COSTS:
-            cells.append(_mean(_values(found, number), form, runs))
+        for _, heading, form, number in _COSTS:
+            mark = _busy(records) if heading == "ms/frame" else ""
+            cells.append(number_cell(mean_over_scenes(_values(found, number)), form, runs, mark))
         yield tuple(cells)
+
+
+def _busy(records: Records) -> str:
+    """Returns the mark of milliseconds if a machine was not quiet; else an empty text."""
+    return "" if all(record.noise.quiet for some in records.values() for record in some) else BUSY
 
 
 def _quality(found: Rendered, trained: Rendered, metric: str, runs: tuple[str, ...]) -> list[Cell]:

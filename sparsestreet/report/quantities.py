@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
 from sparsestreet.records.quality import HELD_OUT, TRAINING
 from sparsestreet.records.summary import RunSummary
+from sparsestreet.report.notes import frames_steady, training_steady
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,8 @@ class Quantity:
     """True: a comparison with the baseline reads as per cent of it (what remains). False: as a signed difference."""
     count: bool = False
     """Whether it counts Gaussians, which a cap can limit."""
+    steady: Callable[[RunSummary], bool] = lambda run: True
+    """Whether a run's value compares with others: a time of a machine that was not quiet does not."""
 
 
 def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
@@ -53,8 +56,8 @@ def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> 
         Quantity("Gaussians", lambda run: float(run.gaussians_total), "{:,.0f}".format, True, count=True),
         *(Quantity(name, _node_count(name), "{:,.0f}".format, True, count=True) for name in nodes),
         Quantity("MB", lambda run: run.bytes_total / 1e6, "{:.2f}".format, True),
-        Quantity("ms/frame", lambda run: run.latency.p50, "{:.1f}".format, True),
-        Quantity("train s", lambda run: run.run.training_seconds, "{:.0f}".format, True),
+        Quantity("ms/frame", lambda run: run.latency.p50, "{:.1f}".format, True, steady=frames_steady),
+        Quantity("train s", lambda run: run.run.training_seconds, "{:.0f}".format, True, steady=training_steady),
     )
     return _measured(known, runs)
 

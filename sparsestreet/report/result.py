@@ -7,6 +7,7 @@ from sparsestreet.records.held_out import HELD_OUT_CURVE
 from sparsestreet.records.quality import HELD_OUT, TRAINING
 from sparsestreet.records.run import RunDescription
 from sparsestreet.records.summary import RunSummary
+from sparsestreet.report.notes import frames_steady, training_steady
 
 FALL = 0.5
 """dB by which a probe of held-out views may end below its best look without a word: looks vary by a few tenths."""
@@ -23,8 +24,9 @@ def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDI
         protocol: the definitions of PSNR and SSIM.
     """
     run, latency = summary.run, summary.latency
-    trained = [] if run.training_seconds is None else [f"{run.training_seconds:.0f} s of training"]
-    steady = "" if latency.noise.quiet else " (on a machine that was not quiet)"
+    unsteady = " (on a machine that was not quiet)"
+    steady, calm = ("" if one(summary) else unsteady for one in (frames_steady, training_steady))
+    trained = [] if run.training_seconds is None else [f"{run.training_seconds:.0f} s of training{calm}"]
     size = [f"{summary.gaussians_total:,} Gaussians", f"{summary.bytes_total / 1e6:.2f} MB", *trained]
     return [
         *(_quality(summary, split, protocol) for split in (HELD_OUT, TRAINING) if split in summary.quality),

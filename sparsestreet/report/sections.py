@@ -26,6 +26,8 @@ class Row:
     difference: bool
     capped: bool
     """Whether a node's ``max_gaussians`` limited one of its counts."""
+    busy: tuple[bool, ...] = ()
+    """For each cell: whether a time of a machine that was not quiet is in it or, of a difference, left out of it."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ def _variant_row(variant: Variant, columns: Sequence[Quantity], over_scenes: boo
     runs = (
         f"{len(units)} scenes, n={len(variant.runs)}" if over_scenes else _seeds(run.run.seed for run in variant.runs)
     )
-    return Row(variant.name, runs, len(units), tuple(cells), False, _capped(variant))
+    return Row(variant.name, runs, len(units), tuple(cells), False, _capped(variant), _busy(variant.runs, columns))
 
 
 def _difference_row(variant: Variant, reference: Variant, columns: Sequence[Quantity], over_scenes: bool) -> Row:
@@ -187,7 +189,13 @@ def _difference_row(variant: Variant, reference: Variant, columns: Sequence[Quan
     ]
     runs = f"{len(units)} scenes, n={len(shared)}" if over_scenes else _seeds(seed for *_, seed in shared)
     label = f"{variant.name} against {reference.name}"
-    return Row(label, runs, len(units), tuple(cells), True, _capped(variant) or _capped(reference))
+    busy = _busy([run for key in shared for run in (*ours[key], *theirs[key])], columns)
+    return Row(label, runs, len(units), tuple(cells), True, _capped(variant) or _capped(reference), busy)
+
+
+def _busy(runs: Iterable[RunSummary], columns: Sequence[Quantity]) -> tuple[bool, ...]:
+    runs = list(runs)
+    return tuple(not all(quantity.steady(run) for run in runs) for quantity in columns)
 
 
 def _clip(run: RunSummary) -> tuple[str, str]:
@@ -213,7 +221,9 @@ def _spread_of(units: Iterable[Iterable[float | None]]) -> Spread | None:
 
 
 def _difference(runs: Sequence[RunSummary], others: Sequence[RunSummary], quantity: Quantity) -> float | None:
-    value, reference = (_spread_of([quantity.value(run)] for run in some) for some in (runs, others))
+    value, reference = (
+        _spread_of([quantity.value(run)] for run in some if quantity.steady(run)) for some in (runs, others)
+    )
     if value is None or reference is None or (quantity.relative and reference.mean == 0):
         return None
     return 100 * value.mean / reference.mean if quantity.relative else value.mean - reference.mean

@@ -9,13 +9,13 @@ from sparsestreet.records.branch_of import BRANCH_OF
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.same_as import SAME_AS
 from sparsestreet.records.strict_json import write_atomically
-from sparsestreet.report.arms import Arm, arms, incomplete, why_apart
+from sparsestreet.report.arms import Arm, arms, busy_arms, incomplete, plain_of, why_apart
 from sparsestreet.report.beside import beside_the_path
 from sparsestreet.report.collect import RunRecord, check_definitions, collect
 from sparsestreet.report.comparison import comparison_data
 from sparsestreet.report.costs import what_arms_cost
 from sparsestreet.report.curves import time_to_quality
-from sparsestreet.report.effects import what_effects_cost
+from sparsestreet.report.effects import effects_alike, what_effects_cost
 from sparsestreet.report.figures import PARETO_COSTS, pareto
 from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
 from sparsestreet.report.grid import Grid, comma_separated, latex, markdown
@@ -58,6 +58,9 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
         *incomplete(found),
         *why_apart(found),
         *_caps(found),
+        *busy_arms(found),
+        *_effects_alike(found),
+        *_baseline(found),
         *_unfinished(records),
         *_taken(records),
         *_branches(records),
@@ -96,7 +99,7 @@ def _grids(
     grids = [
         paper_table(found, failures, protocol, name),
         what_arms_cost(found),
-        what_effects_cost(found),
+        what_effects_cost(found) if effects_alike(found) is None else None,
         differences(found, protocol),
         matched_quality(found, protocol),
         matched_budget(found, protocol),
@@ -125,7 +128,8 @@ def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[li
             name,
             f"Held-out PSNR against {cost[1]}: every run small, every arm's mean large, arrows from plain to pruned "
             "over the scenes and seeds that both have, the front of the means dashed, controls grey. Hollow: the mean "
-            "of an arm that lacks runs, which is in no front.",
+            "of an arm that lacks runs, which is in no front."
+            + "".join(f" {note}." for note in (busy_arms(found) if cost[0] in ("frame", "training") else ())),
             f"no figure of quality against {cost[1]}: no run has both",
         )
     take(
@@ -148,6 +152,21 @@ def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[li
         "no milliseconds by node and effect: no run has records/cost.json",
     )
     return drawn, absent
+
+
+def _effects_alike(found: Sequence[Arm]) -> list[str]:
+    alike = effects_alike(found)
+    return [f"{alike}: records/cost.json of a run has what each costs and brings"] if alike else []
+
+
+def _baseline(found: Sequence[Arm]) -> list[str]:
+    """Says why there are no differences: no arm is the plain one of another."""
+    if len(found) < 2 or any(plain_of(arm, found) not in (None, arm) for arm in found):
+        return []
+    return [
+        "no arm is a baseline, so no table of differences and no arrows: add sparsify=none to the sweep, or compare "
+        "arms with sparsestreet report DIR baseline=NAME"
+    ]
 
 
 def _caps(found: Sequence[Arm]) -> list[str]:

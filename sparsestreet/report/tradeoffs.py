@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Unit, Value, by_scene, mean_over_scenes, plain_of
+from sparsestreet.report.arms import Arm, Unit, Value, busy_arms, by_scene, mean_over_scenes, plain_of
 from sparsestreet.report.grid import Cell, Grid, number_cell
 from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
-from sparsestreet.report.notes import CAPPED
+from sparsestreet.report.notes import BUSY, CAPPED, CLOCKS
 
 LOSSES = (0.1, 0.3, 0.5)
 """Losses of full-image held-out PSNR, dB, that a smaller arm may have."""
@@ -26,6 +26,12 @@ class Measure:
     text: str
     relative: bool
     """Whether the difference is in per cent of the plain run's value."""
+    clock: str = ""
+    """What is timed, a key of ``CLOCKS``; empty: no time."""
+
+    def steady(self, run: RunSummary) -> float | None:
+        """Returns the value of a run, or None for a time of a machine that was not quiet."""
+        return self.value(run) if not self.clock or CLOCKS[self.clock](run) else None
 
 
 def measures(protocol: Protocol) -> tuple[Measure, ...]:
@@ -41,8 +47,8 @@ def measures(protocol: Protocol) -> tuple[Measure, ...]:
         *(Measure(heading, _held_out(metric), text, False) for heading, metric, text in quality),
         Measure("Gaussians", lambda run: float(run.gaussians_total), "{:+.1f}", True),
         Measure("MB", lambda run: run.bytes_total / 1e6, "{:+.1f}", True),
-        Measure("ms/frame", lambda run: run.latency.p50, "{:+.1f}", True),
-        Measure("train s", lambda run: run.run.training_seconds, "{:+.1f}", True),
+        Measure("ms/frame", lambda run: run.latency.p50, "{:+.1f}", True, "frames"),
+        Measure("train s", lambda run: run.run.training_seconds, "{:+.1f}", True, "training"),
     )
 
 
@@ -83,9 +89,14 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
             alone.append(arm.name)
             continue
         runs = tuple(record.folder.name for one in (arm, plain) for record in one.records)
-        found = [paired(arm, plain, one.value, one.relative) for one in shown]
+        found = [paired(arm, plain, one.steady, one.relative) for one in shown]
         n = max((interval.n for interval in found if interval), default=0)
-        cells = [difference_cell(interval, one.text, n, runs) for interval, one in zip(found, shown, strict=True)]
+        cells = [
+            Cell(BUSY, runs=runs)
+            if interval is None and one.clock and (arm.busy(one.clock) or plain.busy(one.clock))
+            else difference_cell(interval, one.text, n, runs)
+            for interval, one in zip(found, shown, strict=True)
+        ]
         rows.append((Cell(f"{arm.title} - {_named(plain)}", runs=runs), Cell(str(n), runs=runs), *cells))
     notes = [
         f"differences paired by scene and seed, mean [{100 * CONFIDENCE:.0f} % t interval]; n: scenes, each the mean "
@@ -95,7 +106,8 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
     if alone:
         notes.append(f"no plain run (or several) at the same place to compare with: {', '.join(alone)}")
     header = (("", "arm - plain"), ("", "n"), *(("", f"{one.heading}{', %' if one.relative else ''}") for one in shown))
-    return Grid("differences", "Differences to the plain method", header, tuple(rows), (*notes, *_caps(arms)))
+    notes += [*_caps(arms), *busy_arms(arms)]
+    return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
 
 
 def is_capped(plain: Arm) -> bool:
@@ -167,7 +179,8 @@ def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
             rows.append((Cell(f"{_named(plain)}, at most {most:g} dB"), *_chosen(best)))
             if control is not None and (best is None or control.share < best.share):
                 notes.append(f"{rows[-1][0].text}: {_in_words(control)} is smaller")
-    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), (*notes, *_caps(arms)))
+    notes += [*_caps(arms), *busy_arms(arms)]
+    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), tuple(notes))
 
 
 def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
@@ -180,7 +193,8 @@ def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
             rows.append((Cell(f"{_named(plain)}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
             if control is not None and (best is None or control.loss < best.loss):
                 notes.append(f"{rows[-1][0].text}: {_in_words(control)} is better")
-    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), (*notes, *_caps(arms)))
+    notes += [*_caps(arms), *busy_arms(arms)]
+    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), tuple(notes))
 
 
 _OF_THIS_SWEEP = "of the arms of this sweep as they were run: nothing is interpolated"
@@ -209,18 +223,18 @@ def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
         return (Cell("none of this sweep"), *[Cell()] * (len(_CHOSEN) - 2))
     runs = tuple(record.folder.name for record in best.arm.records)
 
-    def mean(value: Value, form: str) -> Cell:
+    def mean(value: Value, form: str, clock: str = "") -> Cell:
         ours, theirs = best.arm.units(value), best.plain.units(value)
         found = mean_over_scenes({unit: ours[unit] for unit in ours.keys() & theirs.keys()})
-        return number_cell(found, form, runs)
+        return number_cell(found, form, runs, best.arm.busy(clock) if clock else "")
 
     numbers = (
         number_cell(-best.loss, "{:+.2f}", runs),
         number_cell(100 * best.share, "{:.0f}", runs),
         mean(lambda run: float(run.gaussians_total), "{:,.0f}"),
         mean(lambda run: run.bytes_total / 1e6, "{:.2f}"),
-        mean(lambda run: run.latency.p50, "{:.2f}"),
-        mean(_minutes, "{:.2f}"),
+        mean(lambda run: run.latency.p50, "{:.2f}", "frames"),
+        mean(_minutes, "{:.2f}", "training"),
     )
     return (Cell(best.arm.title, runs=runs), *numbers)
 

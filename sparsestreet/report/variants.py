@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from sparsestreet.records.configuration import (
     IDENTITY_KEYS,
     Setting,
+    chosen_options,
     config_hash,
     differing_options,
     given_keys,
@@ -42,6 +43,8 @@ _MOST_NAMED = 3
 """Largest number of options in the name of a column; the rest go into a note."""
 _LONGEST = 40
 """Largest number of characters of an option in a name."""
+_NO_CHOICE = ("data", "hydra", "sweep", "out", "folder", "method", "sparsify", "assignment")
+"""Keys of a command that tell no arms of one label apart."""
 
 
 @dataclass(frozen=True)
@@ -103,17 +106,43 @@ def _compared(run: RunSummary) -> dict[str, Setting]:
 def _options(run: RunSummary, others: Iterable[RunSummary]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Returns the options by which a run differs from others of its label, and those of them that its name holds.
 
-    If the options that the commands gave distinguish all configurations, the name holds those: the rest follows from
-    them. Otherwise it holds all. ``others`` includes the run itself.
+    If the options that the commands gave distinguish all configurations, choices of groups (``pruning=volume``) among
+    them, the name holds those: the rest follows from them. Otherwise it holds all. ``others`` includes the run itself.
     """
     alike = [other for other in others if other.run.label == run.run.label]
     distinct = {config_hash(_compared(other)): _compared(other) for other in alike}
+    chosen = _chosen(alike, list(distinct))
     commands = [other.run.command for other in alike]
     given = given_keys(commands)
     words = differing_options(list(distinct.values()), commands)
-    short = [tuple(word for word in options if key_of(word) in given) for options in words]
+    short = [
+        (*groups, *(word for word in options if key_of(word) in given))
+        for groups, options in zip(chosen, words, strict=True)
+    ]
     position = list(distinct).index(config_hash(_compared(run)))
     return words[position], (short if len(set(short)) == len(short) else words)[position]
+
+
+def _chosen(runs: Sequence[RunSummary], identities: Sequence[str]) -> list[tuple[str, ...]]:
+    """Returns for each configuration the choices of groups that its commands gave, and that others did not give.
+
+    A group without a dot in its key is no option of the configuration itself; one that differs between repeats says
+    nothing of the configuration.
+    """
+    options = {key for run in runs for key in run.run.config}
+    told: dict[str, list[dict[str, str]]] = {identity: [] for identity in identities}
+    for run in runs:
+        told[config_hash(_compared(run))].append(chosen_options(run.run.command))
+    keys = dict.fromkeys(key for given in told.values() for one in given for key in one)
+    keys = [key for key in keys if key not in options and key.partition("/")[0] not in _NO_CHOICE]
+    keys = [key for key in keys if all(len({one.get(key) for one in given}) == 1 for given in told.values())]
+    keys = [key for key in keys if len({given[0].get(key) for given in told.values()}) > 1]
+    groups = [key.partition("@")[0] for key in keys]
+    names = [group if groups.count(group) == 1 else key for key, group in zip(keys, groups, strict=True)]
+    return [
+        tuple(f"{name}={given[0][key]}" for key, name in zip(keys, names, strict=True) if key in given[0])
+        for given in told.values()
+    ]
 
 
 def _of_data(options: Iterable[str]) -> list[str]:
@@ -134,7 +163,22 @@ def in_few_words(options: Sequence[str], identity: str) -> str:
     >>> in_few_words(["split.stride=5", "seed=1"], identity="0123456789ab")
     'split.stride=5, seed=1'
     """
-    named = [word if len(word) <= _LONGEST else f"{word[:_LONGEST]}..." for word in options[:_MOST_NAMED]]
+    named = [_shortened(word) for word in options[:_MOST_NAMED]]
     if len(options) > _MOST_NAMED:
         named.append(f"and {len(options) - _MOST_NAMED} more #{identity[:6]}")
     return ", ".join(named)
+
+
+def _shortened(word: str) -> str:
+    """Returns an option for a name. The ends of its key and of a class's path tell it apart, so their beginnings go.
+
+    >>> _shortened("callback.pruning.rule._target_=mypaper.rules.VolumeRule")
+    'rule=VolumeRule'
+    """
+    if len(word) <= _LONGEST:
+        return word
+    key, equals, value = word.partition("=")
+    if key.endswith("._target_"):
+        key, value = key.removesuffix("._target_"), value.rpartition(".")[2]
+    short = f"{key.rpartition('.')[2]}{equals}{value}"
+    return short if len(short) <= _LONGEST else f"{short[:_LONGEST]}..."

@@ -50,8 +50,9 @@ class Recipe:
             present = any(isinstance(value, kind) for value in group.values())
             if masked and not present:
                 found.append(
-                    f"the masks of {', '.join(masked)} have no {kind.__name__} among the {part}: choose a "
-                    "sparsification that trains masks, or set sparsify.masks=false"
+                    f"the masks of {', '.join(masked)} have no {kind.__name__} among the {part}: derive one of your "
+                    f"own from sparsestreet.training.{part}.{kind.__name__}, choose a sparsification that trains masks "
+                    "(sparsify=...), or train none, sparsify.masks=false"
                 )
             if present and not masked:
                 found.append(f"{kind.__name__} is among the {part} but no node trains a mask: set sparsify.masks=true")

@@ -63,6 +63,12 @@ def test_nothing_else_is_touched():
     assert with_found_data(["data=kitti", "-m"]) == (["data=kitti", "-m"], None)
 
 
+def test_colmaps_cameras_are_no_other_calibration(tmp_path):
+    """A log of one's own keeps its calibration in cameras.json, beside the rig.json that was made of it."""
+    assert found_option(touch(tmp_path, "cameras.json", "rig.json", "cameras.yaml"))[0] == "rig_json"
+    assert found_option(touch(tmp_path / "b", "cameras.txt"))[0] == "colmap"
+
+
 def test_a_folder_in_quotes(tmp_path):
     odd = touch(tmp_path / "a, b=c", FILES["nuscenes"])
     assert with_found_data(["data=auto", f"data.root='{odd}'"])[0][0] == "data=nuscenes"

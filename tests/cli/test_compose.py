@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 
 import sparsestreet.training.run  # noqa: F401 - its import takes seconds, which are of no test
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import composed, configuration, load_run_config, override_problem
+from sparsestreet.cli.compose import as_typed, composed, configuration, load_run_config, override_problem, value_of
 from sparsestreet.cli.limits import LOGGER_PACKAGES
 from sparsestreet.cli.train import train
 from tests.typed import there
@@ -225,3 +225,77 @@ def test_the_log_of_a_run_is_looked_for_where_the_run_had_it(tmp_path):
     assert folder_of_the_log(tmp_path / "d", tmp_path, "data.log.root=/mine") == Path("/mine")
     # Where the run came from elsewhere, the words are all there is.
     assert folder_of_the_log(tmp_path / "e", tmp_path / "gone", *recorded) == Path("logs/7")
+
+
+PATHS = (
+    "/l/ö",
+    "/l/a,b",
+    "/l/a b=c",
+    "/l/it's",
+    "/l/{x}",
+    "/l/(x)",
+    "/l/50%&#x",
+    "/l/[x]",
+    "l\\b'c\\",
+    '日本/ä "q"',
+    "123",
+    "true",
+    "/l/a ",
+)
+"""Folders as a shell hands them over: without its own quotes."""
+
+
+@pytest.mark.parametrize("path", PATHS)
+def test_a_path_is_taken_as_it_was_typed(path):
+    (root, out) = as_typed([f"data.root={path}", f"out={path}"])
+    assert (value_of(root), value_of(out)) == (path, path)
+    assert override_problem(["data=rig_json", root, out]) is None
+    assert as_typed([root]) == [root]
+
+
+def test_lists_and_quotes_stay_as_they_were_typed(tmp_path):
+    (tmp_path / "a,b").mkdir()
+    words = [
+        "-m",
+        "data.root=x,y",
+        "seed=0,1",
+        "loss=[sky,depth]",
+        "data.root='a, b'",
+        "resume=null",
+        "out=${x}",
+        "schedule.max_steps=[1",
+    ]
+    assert as_typed(words) == words
+    assert as_typed(["-m", f"data.root={tmp_path}/a,b"])[1] == f"data.root='{tmp_path}/a,b'"
+    assert as_typed(["name=Röhrig"]) == ["name='Röhrig'"]
+
+
+def test_a_suggestion_is_of_the_choices_that_were_made():
+    """The key is of a loss that the default configuration lacks."""
+    said = override_problem(["sparsify=paper", "loss.mask_sparsity.weigh=0.2"])
+    assert said == "no key 'loss.mask_sparsity.weigh'; did you mean 'loss.mask_sparsity.weight'?"
+
+
+FILES = {
+    "defaults: [paper_short, override /loss/mask_sparsity@loss: ramped]": (
+        "sparsify/mine.yaml: 'override /loss/mask_sparsity' needs a group, and conf/loss/mask_sparsity.yaml is a file: "
+        "set loss.mask_sparsity.KEY in your file"
+    ),
+    "defaults: [paper_short, override /pruning@callback.pruning.rules: removal]": (
+        "sparsify/mine.yaml: no key 'pruning@callback.pruning.rules'; did you mean pruning@callback.pruning.rule?"
+    ),
+    "defaults: [paper_short, /loss/ramped@loss]": "sparsify/mine.yaml: no option 'ramped' in conf/loss",
+    "defaults: [paper_short]\nschedul: {max_steps: 3}": "sparsify/mine.yaml: no key 'schedul'; did you mean 'schedule'?",
+    "sparsify: {name: [}": "while parsing a flow node",
+}
+"""What stands in a file of the user's -> what is said."""
+
+
+@pytest.mark.parametrize("text", FILES)
+def test_what_is_wrong_in_a_file_names_the_file(text, tmp_path):
+    (tmp_path / "sparsify").mkdir()
+    (tmp_path / "sparsify" / "mine.yaml").write_text(f"# @package _global_\n{text}\n")
+    said = there(override_problem([f"hydra.searchpath=[{tmp_path}]", "sparsify=mine"]))
+    assert said.startswith(FILES[text])
+    assert "mine.yaml" in said
+    assert "\n" not in said

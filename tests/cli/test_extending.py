@@ -21,17 +21,19 @@ from sparsestreet.records.run import RUN
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.scene.masks import MaskScope, StaticMask
+from sparsestreet.scene.masks import MaskScope, StaticMask, StaticMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.views import read_views
 from sparsestreet.training.callbacks import Pruning
+from sparsestreet.training.losses import MaskSparsity
 from tests.cli import configurations
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.toy.density import GrowthDensity
 from tests.cli.toy.loss import MeanColor
 from tests.cli.toy.mask import ProbitMask, ProbitMaskSettings
 from tests.cli.toy.metric import largest_errors
+from tests.cli.toy.ramped import RampedSparsity
 from tests.cli.toy.rule import SizeRule
 from tests.cli.toy.source import DrivenPoints
 from tests.scene.density.scenes import make_rows as rows_at_random
@@ -92,6 +94,21 @@ def test_a_loss(words):
     assert loss.applies(frame)
     # The colors lie 0.3, 0.2 and 0.1 apart.
     torch.testing.assert_close(loss(rendering, frame, scene), torch.tensor(0.1 * 0.2))
+
+
+def test_lambda_over_time():
+    """0.3 of a run of masks: a quarter of that is a quarter of the weight, behind it all of it."""
+    target = "loss.mask_sparsity._target_=tests.cli.toy.ramped.RampedSparsity"
+    loss = recipe_of(composed("sparsify=paper", target, "++loss.mask_sparsity.ramp=0.3")).losses["mask_sparsity"]
+    assert isinstance(loss, RampedSparsity)
+    scene, frame = SceneGraph({"background": background(9, mask=StaticMaskSettings(sparsity_weight=0.7))}), frame_at()
+    drawn = render(scene, frame)
+    full, some, late = (
+        loss(replace(drawn, state=replace(drawn.state, progress=at)), frame, scene) for at in (0.3, 0.075, 0.9)
+    )
+    whole = MaskSparsity(loss.weight)(drawn, frame, scene)
+    assert whole > 0
+    torch.testing.assert_close(torch.stack([full, some, late]), torch.stack([whole, whole / 4, whole]))
 
 
 def test_a_rule():

@@ -187,7 +187,7 @@ def test_a_job_begins_with_the_latest_moment_before_its_own_pruning():
 def test_jobs_that_cannot_be_counted_are_said(capsys):
     assert jobs([]) == 2
     assert jobs(["--help"]) == 0
-    assert "What sweeps of conf/sweep would train" in capsys.readouterr().out
+    assert "What sweeps of conf/sweep, or one of the command line, would train" in capsys.readouterr().out
     assert jobs(["+sweep=tony"]) == 2
     assert "sparsestreet jobs: no option 'tony' in conf/sweep" in capsys.readouterr().err
 

@@ -9,8 +9,20 @@ from omegaconf import DictConfig, OmegaConf
 from sparsestreet.cli import sweep
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import CONF, override_problem
+from sparsestreet.cli.jobs import SweepCount, count_jobs
+from sparsestreet.cli.jobs import jobs as jobs_command
 from sparsestreet.cli.report import sweep_name
-from sparsestreet.cli.sweep import OF_DRIVES, as_sweep, finished, note_of_sweep, run_job, sweep_problem, sweep_status
+from sparsestreet.cli.sweep import (
+    OF_DRIVES,
+    as_sweep,
+    finished,
+    job_problem,
+    note_of_sweep,
+    run_job,
+    sweep_problem,
+    sweep_status,
+    with_fixed_keys,
+)
 from sparsestreet.cli.train import train
 from sparsestreet.records.costs import update_costs
 from sparsestreet.records.failures import read_failures
@@ -247,3 +259,31 @@ def test_a_sweep_goes_on_after_a_failure_and_resumes(tmp_path, tiny_street, caps
 def test_a_slip_in_a_sweep_is_one_line(capsys):
     assert train(["+sweep=tony"]) == 2
     assert f"no option 'tony' in conf/sweep: choose one of {', '.join(SWEEPS)}" in capsys.readouterr().err
+
+
+def test_arms_that_differ_have_folders_that_say_so():
+    """The groups and values that the sweep varies, and nothing that all jobs share or the label tells."""
+    asked = ["-m", "sparsify=paper_short,importance", "pruning@callback.pruning.rule=importance,removal", "seed=0,1",
+             "schedule.max_steps=40", "loss.depth.weight=0.5,1"]  # fmt: skip
+    fixed = with_fixed_keys(asked)[-1]
+    job = ["sparsify=paper_short", "pruning@callback.pruning.rule=removal", "seed=1", "schedule.max_steps=40"]
+    cfg = composed(*job, "loss.depth.weight=0.5", fixed, "hydra.job.num=3")
+    assert cfg.hydra.sweep.subdir == "3_streetgs+paper_short_pruning=removal_weight=0.5_seed1"
+    assert with_fixed_keys(asked[1:]) == asked[1:]
+
+
+def test_a_job_that_cannot_be_ends_a_sweep_before_its_first_training(capsys):
+    """The first arm is good, the third has a rate that is none; controls wait for the runs that they count."""
+    asked = ["-m", "seed=0,1", "node.background.sh_degree=3,1,many"]
+    assert train(asked) == 2
+    said = capsys.readouterr().err
+    assert "job 3 of 6 (seed=0 node.background.sh_degree=many): " in said
+    assert "node.background.sh_degree must be int, got 'many'; nothing was trained" in said
+    assert job_problem(["-m", "sparsify=removal,random", "count_of=of/nothing"]) is None
+    assert job_problem(["sparsify=none"]) is None
+
+
+def test_jobs_of_the_command_line_are_counted(capsys):
+    """Two arms, two seeds; the third seed repeats the first."""
+    assert count_jobs(["-m"], ["sparsify=none,removal", "seed=0,1,0"]) == [SweepCount("-m", 6, 2, 0, 0.0)]
+    assert jobs_command(["sparsify=none"]) == 2

@@ -1,5 +1,6 @@
 """Small frames and runs for the tests of this folder."""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -139,3 +140,13 @@ def make_summary(
         latency_protocol=latency.protocol,
         guards=GuardCounts({"drawn": 900, "overflowed": 0} | (alarms or {}), alarms or {}),
     )
+
+
+def disturbed(summary: RunSummary, *clocks: str) -> RunSummary:
+    """The record with noise while "frames" were timed, or while "training" was."""
+    loud = replace(NOISE, before=0.6, quiet=False)
+    if "training" in clocks:
+        summary = replace(summary, run=replace(summary.run, noise=loud))
+    if "frames" in clocks:
+        summary = replace(summary, latency=replace(summary.latency, noise=loud))
+    return summary

@@ -5,8 +5,10 @@ import pytest
 from sparsestreet.pictures import history
 from sparsestreet.pictures.history import draw_history
 from sparsestreet.records.ledger import LEDGER, MASK, PRUNING, CountChange
+from sparsestreet.records.run import RUN
 from sparsestreet.records.strict_json import RecordError, write_atomically
 from sparsestreet.training.callbacks import mask_training, pruning
+from tests.evaluation.frames import make_run
 
 CHANGES = [
     CountChange(0, "background", 0, 100, "seeds"),
@@ -49,7 +51,8 @@ def test_psnr_is_taken_where_it_was_logged(tmp_path, drawn):
         "epoch,psnr,step,train/l1,val/psnr\n0,20.5,9,0.1,\n0,,9,,18.25\n1,21.5,19,0.1,\n"
     )
     draw_history(tmp_path)
-    curves, events = drawn["psnr.png"]
+    curves, events, title = drawn["psnr.png"]
+    assert title == "PSNR over training"
     assert curves == {"training, running mean": ((9, 19), (20.5, 21.5)), "held out": ((9,), (18.25,))}
     assert events == [(20, "mask"), (30, "pruning")]
 
@@ -105,3 +108,15 @@ def test_a_malformed_ledger_names_file_and_line(tmp_path, text, message):
     write_atomically(LEDGER.path(tmp_path), text)
     with pytest.raises(RecordError, match=message):
         LEDGER.read(tmp_path)
+
+
+def test_a_curve_reaches_the_last_step_and_says_that_nothing_was_held_out(tmp_path, drawn):
+    """The last change is at step 30 of 400, and validation never came."""
+    LEDGER.write(tmp_path, CHANGES)
+    RUN.write(tmp_path, make_run(steps=400))
+    (tmp_path / "curves").mkdir()
+    (tmp_path / "curves" / "metrics.csv").write_text("epoch,psnr,step\n0,20.5,9\n")
+    draw_history(tmp_path)
+    steps, counts, _ = drawn["counts.png"]
+    assert (steps[-2:], counts["background"][-2:]) == ([30, 400], [40, 40])
+    assert "no look at held-out views: trainer.val_check_interval" in drawn["psnr.png"][2]

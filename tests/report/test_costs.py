@@ -73,4 +73,6 @@ def test_a_machine_that_was_not_quiet_is_named():
     calm, loud = make_summary("m"), make_summary("m", 1)
     latency = replace(loud.latency, noise=replace(loud.latency.noise, quiet=False))
     runs = [record(calm), record(replace(loud, latency=latency))]
-    assert what_arms_cost(arms(runs)).notes[-1].startswith("some milliseconds are of a machine that was not quiet")
+    grid = what_arms_cost(arms(runs))
+    assert grid.notes[-1].startswith("§ times of a machine that was not quiet, compared with no other: frames of m")
+    assert [cell.text for cell in grid.rows[0]][-2:] == ["40.00 §", "100.0"]

@@ -7,6 +7,7 @@ from typing import Any
 import matplotlib.axes
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
@@ -17,7 +18,7 @@ from sparsestreet.records.ledger import LEDGER, PRUNING, CountChange
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect, figures, figures_time
 from sparsestreet.report.arms import arms
-from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, marker, panels, pareto, short, write_svg
+from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, panels, pareto, short, styles, write_svg
 from sparsestreet.report.figures_time import (
     _counts,
     _frame_costs,
@@ -51,8 +52,8 @@ def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
     text = path.read_text()
     titles = [name for name in ("full image", "people", "vehicles") if f">{name}<" in text]
     assert titles == ["full image", "vehicles"]  # no run measured people
-    # 3 runs and a mean, of 2 plain or pruned arms and a grey one, in 2 panels; and one in the legend.
-    assert len(re.findall(r"<use [^>]*fill: #1f86c9", text)) == 2 * 2 * 4 + 1
+    # 3 runs and a mean, of a plain, a pruned and a grey arm, in 2 panels.
+    assert [len(re.findall(rf"<use [^>]*fill: {paint}", text, re.I)) for paint in (COLORS[0], COLORS[2])] == [8, 8]
     assert len(re.findall(rf"<use [^>]*stroke: {GREY}", text)) >= 2 * 4
     assert "control: random" in text
 
@@ -124,7 +125,7 @@ def test_counts_are_of_all_nodes(tmp_path):
     LEDGER.write(tmp_path, [*starts, CountChange(5, "background", 100, 30, PRUNING)])
     axes = Figure().subplots()
     (arm,) = arms([record(make_summary("plain"))])
-    _counts(axes, arm, tmp_path)
+    _counts(axes, styles([arm])[arm.name], tmp_path)
     line, dots = ([np.asarray(values).tolist() for values in drawn.get_data()] for drawn in axes.get_lines())
     assert (line, dots) == ([[0, 5], [120, 50]], [[5], [50]])
 
@@ -245,8 +246,7 @@ def test_marks_in_the_legend_are_those_of_the_panel(canvas, tmp_path):
     assert list(handles) == ["a", "b", "plain", "paper", "control: random", "removal", "front of the means"]
     assert [handles[name].get_color() for name in ("a", "b", "control: random")] == [*COLORS[:2], GREY]
     assert [handles[name].get_marker() for name in list(handles)[2:6]] == ["o", "s", "x", "D"]
-    assert [marker(arm) for arm in found] == ["o", "s", "x", "o", "D"]
-    assert marker(replace(found[0], sparsify="of somebody else")) == "P"
+    assert [styles(found)[arm.name].marker for arm in found] == ["o", "s", "x", "o", "D"]
 
 
 def test_a_figure_of_one_region_or_none(canvas, tmp_path):
@@ -364,3 +364,66 @@ def test_marks_say_what_they_are(found, tmp_path):
         write_svg(figure, tmp_path / "b.svg", {"one": ["a <b>", "c"]})
     write_svg(figure, tmp_path / "b.svg", {"one": ["a <b>"]})
     assert "<title>a &lt;b&gt;</title>" in (tmp_path / "b.svg").read_text()
+
+
+RULES = [
+    (sparsify, kind) for sparsify in ("paper_short", "paper", "mine", "yours") for kind in ("importance", "volume", "x")
+]
+
+
+def of_a_sweep(folder):
+    """Twelve arms of one method: four sparsifications with three rules each, told apart by a group alone."""
+    for index, (sparsify, kind) in enumerate(RULES):
+        run = folder / f"{index}"
+        command = f"sparsestreet train sparsify={sparsify} pruning@callback.pruning.rule={kind}"
+        config = {"callback.pruning.rule._target_": kind}
+        yield record(
+            make_summary(
+                f"streetgs+{sparsify}", 0, 20.0 + index / 7, {"a": 1000 + 90 * index}, config=config, command=command
+            ),
+            str(run),
+        )
+
+
+def test_every_arm_of_a_figure_has_a_look_of_its_own(tmp_path):
+    """By color and marker in the scatter, by color and dash over time, with its own entry in the legend."""
+    found = arms(list(of_a_sweep(tmp_path)))
+    assert len(found) == len(RULES)
+    drawn = styles(found).values()
+    for look in (
+        {(one.color, one.marker) for one in drawn},
+        {(one.color, one.dashes) for one in drawn},
+        {one.kind for one in drawn},
+    ):
+        assert len(look) == len(RULES)
+    assert "mine pruning=volume" in {one.kind for one in drawn}
+    # Sparsifications that other figures draw alike, or do not know, in two methods.
+    pairs = [
+        make_summary(f"{method}+{sparsify}")
+        for method in "ab"
+        for sparsify in ("paper", "paper_short", "mine", "other")
+    ]
+    drawn = styles(arms([record(one) for one in pairs])).values()
+    assert len({(one.method, one.marker) for one in drawn}) == len(pairs)
+
+
+def test_names_of_bars_do_not_run_into_each_other(tmp_path, canvas):
+    runs = list(of_a_sweep(tmp_path))[:4]
+    runs = [
+        record(
+            replace(
+                one.summary,
+                run=replace(one.summary.run, label="streetgs@all_rigid-drivestudio_legacy_scaled+paper_short"),
+            ),
+            str(one.folder),
+        )
+        for one in runs
+    ]
+    for one in runs:
+        update_costs(one.folder, nodes={"rigid": NodeCost(10, 0.1, 4.0, 1.0)})
+    frame_waterfall(arms(runs), tmp_path / "w.svg")
+    figure = canvas["w.svg"]
+    FigureCanvasAgg(figure).draw()
+    boxes = [text.get_window_extent() for text in figure.axes[0].get_yticklabels()]
+    assert len(boxes) == 3  # two of the runs are of one arm
+    assert not any(one.overlaps(other) for index, one in enumerate(boxes) for other in boxes[:index])

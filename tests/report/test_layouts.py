@@ -12,7 +12,7 @@ from sparsestreet.records.quality import HELD_OUT, TRAINING, MetricSummary
 from sparsestreet.report.arms import Arm, arms
 from sparsestreet.report.layouts import metric_id, paper_table
 from sparsestreet.report.published import TABLES
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import disturbed, make_summary
 from tests.report.sweep_folder import record
 from tests.typed import there
 
@@ -154,7 +154,7 @@ def test_headers_and_notes_of_a_table():
     assert "control random: as many Gaussians, drawn at random" in ablation.notes
     assert any(note.startswith("reconstruction: of the training views of the runs") for note in ablation.notes)
     assert "failed runs are in no mean" not in ablation.notes
-    assert f"protocol drivestudio: {', '.join(DRIVESTUDIO.metrics)}" in ablation.notes[1]
+    assert f"protocol drivestudio: {', '.join(DRIVESTUDIO.metrics)}" in ablation.notes[2]
     whole = arms([record(make_summary("omnire", psnr=None, training_psnr=30.0, split="none"))])
     of_any = paper_table(whole, [], DRIVESTUDIO, None)
     assert not any(note.startswith("reconstruction: of the training") for note in of_any.notes)
@@ -176,3 +176,26 @@ def test_words_of_a_rows_options_choose_its_arm():
         arm = Arm(name, "x", row.method or "", row.sparsify, (), (record(summary),))
         grid = paper_table([arm], [], DRIVESTUDIO, "table3_pruning")
         assert grid.rows[[one.name for one in table.rows].index(row.name)][0].text == name
+
+
+def test_frames_of_a_busy_machine_carry_the_mark_where_they_stand():
+    runs = [
+        make_summary("omnire", milliseconds=8.0),
+        disturbed(make_summary("omnire+mine", milliseconds=16.0), "frames"),
+    ]
+    grid = paper_table(arms([record(one) for one in runs]), [], DRIVESTUDIO, None)
+    assert {name: row["FPS"].text for name, row in rows_of(grid).items()} == {
+        "omnire": "125.0",
+        "omnire+mine": "62.5 §",
+    }
+    assert grid.notes[-1].endswith("compared with no other: frames of omnire+mine")
+
+
+def test_columns_of_the_paper_without_a_number_are_left_out():
+    """Of a method and data that the paper has not, nothing is published; of one that it has, every column is."""
+    own = paper_table(arms([record(make_summary("mine"))]), [], DRIVESTUDIO, None)
+    assert not any(heading.endswith("paper") for _, heading in own.header)
+    assert len(own.header) == 2 + 14
+    assert not any("paper" in note for note in own.notes)
+    both = paper_table(arms([record(make_summary("mine")), record(make_summary("pvg"))]), [], DRIVESTUDIO, None)
+    assert sum(heading.endswith("paper") for _, heading in both.header) == 14

@@ -124,4 +124,5 @@ def test_a_machine_that_was_not_quiet_is_named(tmp_path):
     PRESETS.write(tmp_path, replace(PRESETS.read(tmp_path), noise=replace(NOISE, quiet=False)))
     assert path.is_file()
     grid = rendered_otherwise(arms([record(make_summary("m"), str(tmp_path))]), DRIVESTUDIO)
-    assert grid.notes[-1] == "milliseconds of a machine that was not quiet"
+    assert grid.notes[-1] == "§ times of a machine that was not quiet, compared with no other: m"
+    assert [row[-1].text for row in grid.rows] == ["20.00 §", "12.00 §"]

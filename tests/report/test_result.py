@@ -8,7 +8,7 @@ import pytest
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.report.result import result_lines
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import disturbed, make_summary
 
 
 def test_what_a_run_came_to():
@@ -44,6 +44,11 @@ def test_what_held_out_views_have_lost_is_said(tmp_path):
     assert "PSNR 33.00 dB at step 1, 32.40 dB at the end" in result_lines(make_summary("plain", 0, 24.35), tmp_path)[-2]
     HELD_OUT_CURVE.write(tmp_path, [HeldOutLook(9.0, 1, 32.8, None, None), HeldOutLook(9.0, 2, 32.4, None, None)])
     assert not any("better before" in line for line in result_lines(make_summary("plain", 0, 24.35), tmp_path))
+
+
+def test_seconds_of_a_busy_machine_say_so():
+    said = result_lines(disturbed(make_summary("plain", 0, 24.35), "training"), Path("a"))
+    assert any(line.endswith("100 s of training (on a machine that was not quiet), 40.0 ms a frame") for line in said)
 
 
 def test_what_was_held_back_and_what_rested_is_said_again():

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.report import RunRecord, Spread, sections, spread
-from tests.evaluation.frames import make_summary
+from sparsestreet.report import RunRecord, Spread, markdown, sections, spread
+from tests.evaluation.frames import disturbed, make_summary
 
 
 def records(*summaries):
@@ -293,3 +293,26 @@ def test_spread():
     assert spread([]) is None
     assert spread([3.0]) == Spread(3.0, None, 1)
     assert spread([1.0, 2.0, 6.0]).sd == pytest.approx(7**0.5)
+
+
+def test_a_time_of_a_busy_machine_is_marked_and_compared_with_no_other():
+    """The plain training of seed 0 was disturbed, and all frames of ours. Left: 100 s of 400 s with seed 1."""
+    found = records(
+        disturbed(make_summary("plain", 0, training_seconds=900.0), "training"),
+        make_summary("plain", 1, training_seconds=400.0),
+        *(
+            disturbed(make_summary("ours", seed, training_seconds=100.0, milliseconds=13.0), "frames")
+            for seed in (0, 1)
+        ),
+    )
+    (section,) = sections(found, "plain")
+    lines = [line.split(" | ") for line in markdown([section]).splitlines() if line.startswith("| ")]
+    ms, seconds = (lines[0].index(heading) for heading in ("ms/frame", "train s |"))
+    plain, ours, against = lines[2:]
+    assert (plain[ms], plain[seconds]) == ("40.0 ± 0.0", "650 ± 354 § |")
+    assert (ours[ms], ours[seconds]) == ("13.0 ± 0.0 §", "100 ± 0 |")
+    assert (against[ms], against[seconds]) == ("§", "25.0 % (n=1) |")
+    said = "§ times of a machine that was not quiet, compared with no other: frames of ours; training of plain"
+    assert said in section.notes
+    (quiet,) = sections(PLAIN_AND_OURS, "plain")
+    assert not any("§" in note for note in quiet.notes)

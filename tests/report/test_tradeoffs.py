@@ -9,7 +9,7 @@ from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
 from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.report.arms import arms
 from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import disturbed, make_summary
 from tests.report.sweep_folder import record, street_runs
 
 
@@ -213,3 +213,22 @@ def test_who_has_no_plain_value_has_no_relative_difference():
     zero = [make_summary("m", training_seconds=0.0), make_summary("m+removal", training_seconds=100.0)]
     grid = differences(arms([record(run) for run in zero]), DRIVESTUDIO)
     assert by_heading(grid, grid.rows[0])["train s, %"].text == "-"
+
+
+def test_a_difference_of_times_is_of_quiet_pairs_alone():
+    """Of the plain frames one seed was disturbed, of the small arm's training every seed."""
+    runs = [
+        disturbed(make_summary("plain", 0, milliseconds=900.0), "frames"),
+        make_summary("plain", 1, milliseconds=20.0),
+        *(
+            disturbed(make_summary("plain+removal", seed, 25.0, {"a": 9}, milliseconds=5.0), "training")
+            for seed in (0, 1)
+        ),
+    ]  # fmt: skip
+    found = arms([record(run) for run in runs])
+    grid = differences(found, DRIVESTUDIO)
+    row = by_heading(grid, grid.rows[0])
+    assert (row["ms/frame, %"].text, row["train s, %"].text) == ("-75.0 (n=1)", "§")
+    assert grid.notes[-1].endswith("frames of plain; training of plain+removal")
+    best = matched_quality(found, DRIVESTUDIO)
+    assert by_heading(best, best.rows[0])["train minutes"].text.endswith(" §")

@@ -106,3 +106,49 @@ def test_counts_follow_from_another_run_in_controls_alone():
     controls = [make_summary("m+random", config={key: value, "count_of": "../m"}) for value in (500, 1000)]
     assert len(variants(controls)) == 1
     assert len(variants([with_option(value, label="m+random", key=key) for value in (500, 1000)])) == 2
+
+
+def rule(kind, seed, *more, keep=0.3, sparsify="paper_short"):
+    """A job of a sweep whose commands choose the rule by its group, beside other words."""
+    words = [f"sparsify={sparsify}", f"pruning@callback.pruning.rule={kind}", f"seed={seed}", *more]
+    config = {"callback.pruning.rule._target_": f"mypaper.rules.of.mine.{kind.title()}Rule", "node.a.keep": keep}
+    config |= {"callback.pruning.rule.gate": None} if kind == "volume" else {"callback.pruning.rule.nodes": ["a"]}
+    command = f"sparsestreet train {' '.join(words)}"
+    return make_summary(f"streetgs+{sparsify}", seed, config=config, command=command)
+
+
+def test_arms_of_a_sweep_are_named_by_the_groups_that_it_varied():
+    """2 x 2 with two seeds; the place of the group and what it brings into the configuration are in no name."""
+    runs = [rule(kind, seed, sparsify=sparsify) for kind in ("importance", "volume") for sparsify in ("mine", "paper")
+            for seed in (0, 1)]  # fmt: skip
+    expected = [
+        (f"streetgs+{sparsify} pruning={kind}", 2)
+        for sparsify in ("mine", "paper")
+        for kind in ("importance", "volume")
+    ]
+    assert names(variants(runs)) == expected
+    values = [
+        rule(kind, 0, f"node.a.keep={keep}", "data=drivestudio", keep=keep)
+        for kind in ("importance", "volume")
+        for keep in (0.25, 0.5)
+    ]
+    assert [name for name, _ in names(variants(values))] == [
+        f"streetgs+paper_short pruning={kind}, node.a.keep={keep}"
+        for kind in ("importance", "volume")
+        for keep in (0.25, 0.5)
+    ]
+
+
+def test_a_group_that_does_not_tell_arms_apart_names_none():
+    """Repeats by two words, or two configurations by one: the class of the rule is named, and its end is kept."""
+    one, two = rule("volume", 0), rule("volume", 1, "pruning@other.place=x")
+    assert names(variants([one, two])) == [("streetgs+paper_short", 2)]
+    plain = [
+        dataclasses.replace(run, run=dataclasses.replace(run.run, command="sparsestreet train"))
+        for run in (one, rule("importance", 0))
+    ]
+    assert sorted(variant.name for variant in variants(plain))[0].startswith("streetgs+paper_short rule=ImportanceRule")
+    both = [rule("volume", 0, "pruning@other.place=x"), rule("importance", 0, "pruning@other.place=y")]
+    assert [name for name, _ in names(variants(both))][1].startswith(
+        "streetgs+paper_short pruning@callback.pruning.rule=volume, "
+    )

@@ -101,6 +101,9 @@ def test_parts_that_fit_have_no_problem(settings, kinds):
 def test_each_part_that_lacks_its_counterpart_is_named(settings, kinds, said):
     found = recipe(settings, *kinds).problems()
     assert [problem[: len(start)] for problem, start in zip(found, said, strict=True)] == said
+    assert all(
+        "derive one of your own from sparsestreet.training." in problem for problem in found if "masks of" in problem
+    )
     with pytest.raises(ValueError, match=r"; ".join(said) if len(said) == 1 else rf"^{said[0]}.*; {said[1]}"):
         recipe(settings, *kinds).check()
 

@@ -21,7 +21,13 @@ class ColmapReader(RecordedReader):
     The world is the model's. There are no returns and no boxes.
     """
 
-    marks = Marks(("cameras.*", "sparse/0/cameras.*", "sparse/cameras.*", "colmap/sparse/0/cameras.*"))
+    marks = Marks(
+        tuple(
+            f"{place}cameras.{kind}"
+            for place in ("", "sparse/0/", "sparse/", "colmap/sparse/0/")
+            for kind in ("bin", "txt")
+        )
+    )
 
     model: str | None = None
     """The model's folder below the root; None: the root, sparse/0, sparse or colmap/sparse/0."""

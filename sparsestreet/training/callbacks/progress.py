@@ -25,8 +25,8 @@ class TrainingProgress(Callback):
         self._bar: Progress | None = None
         self._task = TaskID(0)
         self._since = (0, 0.0)
-        self._held_out: float | None = None
-        """PSNR, dB."""
+        self._held_out: tuple[float | None, int] = None, 0
+        """PSNR, dB, and the step that it was measured at; None until it was."""
 
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         self._since = (trainer.global_step, time.perf_counter())
@@ -52,7 +52,7 @@ class TrainingProgress(Callback):
     def on_validation_end(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         # Read once, since reading waits for a GPU.
         psnr = trainer.callback_metrics.get("val/psnr")
-        self._held_out = None if psnr is None else float(psnr)
+        self._held_out = None if psnr is None else float(psnr), trainer.global_step
 
     def teardown(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
         self._stop()
@@ -77,8 +77,11 @@ class TrainingProgress(Callback):
         now = time.perf_counter()
         self._since = (trainer.global_step, now)
         parts = [f"{(trainer.global_step - first) / max(now - then, 1e-9):.1f} steps/s"]
-        known = {"train": system.said.newest.get("psnr"), "held out": self._held_out}
-        parts += [f"{label} {psnr:.2f} dB" for label, psnr in known.items() if psnr is not None]
+        train, (held_out, looked) = system.said.newest.get("psnr"), self._held_out
+        parts += [] if train is None else [f"train {train:.2f} dB"]
+        # Of an earlier step, it would read as that of a model that fits its training views alone.
+        of = "" if looked == trainer.global_step else f" (step {looked})"
+        parts += [] if held_out is None else [f"held out {held_out:.2f} dB{of}"]
         parts += [f"{name} {rows:,}" for name, rows in system.scene.counts().items()]
         return ", ".join(parts)
 

@@ -61,9 +61,13 @@ def converted(tmp_path, monkeypatch):
     sys.modules.pop("own_log")
 
 
-def test_a_log_of_ones_own_is_read_as_it_was_planned(converted):
+def test_a_log_of_ones_own_is_read_as_it_was_planned(converted, capsys):
     folder, convert = converted
     convert(folder)
+    (said,) = capsys.readouterr().out.splitlines()
+    assert said.startswith(
+        f"{folder}/rig.json: frames: 4, cameras: {len(CAMERAS)}, tracks of boxes: 1; now sparsestreet"
+    )
     reader = RigJsonReader(root=folder)
     assert reader.check() == []
     recording = reader.recording()

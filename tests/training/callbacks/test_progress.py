@@ -70,7 +70,7 @@ def test_a_line_by_hand(caplog, seconds):
         trainer.walk(50)
     assert caplog.messages == [
         "step 40 of 100: 2.5 steps/s, background 1,200, rigid 3",
-        "step 50 of 100: 20.0 steps/s, train 19.00 dB, held out 21.46 dB, background 1,200, rigid 3",
+        "step 50 of 100: 20.0 steps/s, train 19.00 dB, held out 21.46 dB (step 40), background 1,200, rigid 3",
     ]
 
 
