@@ -34,6 +34,7 @@ from sparsestreet.cli.sweep import (
     sweep_status,
     with_fixed_keys,
 )
+from sparsestreet.demand import as_demand
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -135,8 +136,6 @@ def app(cfg: DictConfig) -> float | None:
         print(f"sparsestreet train{f', {name}' if name else ''}: {sentence(error)}", file=sys.stderr)
         sys.exit(1)
     except Exception as error:
-        from sparsestreet.types import as_demand
-
         demand = as_demand(error)
         if demand is None or "HYDRA_FULL_ERROR" in os.environ:
             raise

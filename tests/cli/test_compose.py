@@ -285,7 +285,7 @@ FILES = {
         "sparsify/mine.yaml: no key 'pruning@callback.pruning.rules'; did you mean pruning@callback.pruning.rule?"
     ),
     "defaults: [paper_short, /loss/ramped@loss]": "sparsify/mine.yaml: no option 'ramped' in conf/loss",
-    "defaults: [paper_short]\nschedul: {max_steps: 3}": "sparsify/mine.yaml: no key 'schedul'; did you mean 'schedule'?",
+    "defaults: [paper_short]\nschedul: {max_steps: 3}": "sparsify/mine.yaml: no key 'schedul'; did you mean",
     "sparsify: {name: [}": "while parsing a flow node",
 }
 """What stands in a file of the user's -> what is said."""
