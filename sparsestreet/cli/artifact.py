@@ -29,5 +29,5 @@ def export_artifact(
         0 if described is None else described.seed,
     )
     counts = write_artifact(out, served, read_views(run / FILE_NAME), provenance, car or DEFAULT_CAR)
-    said = ", ".join(f"{count} {what}" for what, count in counts.items())
+    said = ", ".join(f"{count} {what[:-1] if count == 1 else what}" for what, count in counts.items())
     print(f"{out}: scene {name!r} with {said}; sparsestreet serve {run} gives its pictures")

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.cli.options import run_command
+from sparsestreet.listening import Callers, opened_at
 
 USAGE = """\
 sparsestreet view RUN [key=value ...]     a trained street in the browser: fly, play, hide and move objects
@@ -20,6 +21,7 @@ sparsestreet view RUN [key=value ...]     a trained street in the browser: fly, 
   device    cpu or cuda (default: a GPU if there is one)
   host      whom it answers (default: 127.0.0.1, this machine alone); anybody who reaches it can use it
   port      default: 8080, or the next that is free
+  known_as  [street.lab,10.0.0.5]: further names of this machine by which browsers reach it, such as a proxy's
 """
 
 
@@ -35,12 +37,14 @@ class ViewRequest:
     device: str | None = None
     host: str = "127.0.0.1"
     port: int = 8080
+    known_as: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not 1 <= self.fps <= 60:
             raise ValueError(f"fps lies in 1 to 60, got {self.fps:g}")
         if not 0 <= self.port < 2**16:
             raise ValueError(f"a port lies in 0 to 65535, got {self.port}")
+        Callers.of("127.0.0.1", self.known_as)
 
 
 def view(arguments: list[str]) -> int:
@@ -71,8 +75,9 @@ def _view(request: ViewRequest) -> None:
         port=request.port,
         frames_per_second=request.fps,
         save=request.save or file,
+        known_as=request.known_as,
     )
-    print(f"http://{request.host}:{viewer.port}  (Ctrl-C ends it)", flush=True)
+    print(f"http://{opened_at(request.host, viewer.port)}  (Ctrl-C ends it)", flush=True)
     try:
         viewer.run()
     except KeyboardInterrupt:

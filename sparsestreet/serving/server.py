@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import grpc
 
 import sparsestreet
+from sparsestreet.listening import address, check_address
 from sparsestreet.records.provenance import this_source
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
@@ -163,6 +164,7 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
 
     Raises OSError where nobody can listen there.
     """
+    check_address(host, port)
     service = Sensorsim(scenes, encoders=workers)
     size = [(f"grpc.max_{way}_message_length", LARGEST_MESSAGE) for way in ("send", "receive")]
     # Two servers on one port would share its requests.
@@ -177,9 +179,9 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
     handlers.append(grpc.method_handlers_generic_handler("grpc.health.v1.Health", {"Check": health}))
     server.add_generic_rpc_handlers(tuple(handlers))
     try:
-        bound = server.add_insecure_port(f"{host}:{port}")
+        bound = server.add_insecure_port(address(host, port))
     except RuntimeError as error:
-        raise OSError(f"nobody can listen on {host}:{port}: another server may, choose another port=") from error
+        raise OSError(f"nobody can listen on {address(host, port)}: {error}") from error
     server.start()
     return server, bound
 
