@@ -32,7 +32,7 @@ _POLICY = (
     "script-src 'unsafe-inline' 'unsafe-eval' data: blob:; worker-src data: blob:; style-src 'unsafe-inline'; "
     "img-src data: blob:; font-src data:; connect-src data: blob:; base-uri 'none'; form-action 'none'\">"
 )
-"""No network at all. viser unpacks its program into the page, compiles, and gives its workers addresses that hold their code."""
+"""No network at all. viser unpacks its program into the page, compiles some, and starts workers at data: addresses."""
 _LOOK = 10.0
 """Meters to the point around which a viewer's camera turns."""
 

@@ -107,7 +107,8 @@ def test_a_browser_draws_it_from_a_file_as_it_is_rendered(run, tmp_path):
         chromium.call(
             "Page.addScriptToEvaluateOnNewDocument",
             source="window.forbidden=[];document.addEventListener('securitypolicyviolation',e=>"
-            "window.forbidden.push(e.violatedDirective+' '+e.blockedURI));window.sorted=0;const W=Worker;window.Worker=class extends W{constructor(...a){super(...a);"
+            "window.forbidden.push(e.violatedDirective+' '+e.blockedURI));window.sorted=0;"
+            "const W=Worker;window.Worker=class extends W{constructor(...a){super(...a);"
             "this.addEventListener('message',e=>{if(e.data.sortedIndices)window.sorted++})}}",
         )
         chromium.open(out.as_uri(), 480, 320)

@@ -180,12 +180,14 @@ def test_a_window_that_says_once_where_it_is_gets_a_picture_and_nobody_a_tunnel(
         "type": "ViewerCameraMessage", "wxyz": [1.0, 0, 0, 0], "position": [0.0, 0, 0], "fov": 1.0, "near": 0.01,
         "far": 1000.0, "image_height": 40, "image_width": 64, "look_at": [1.0, 0, 0], "up_direction": [0.0, 0, 1.0],
     }  # fmt: skip
-    with window(viewer.port) as socket:
-        socket.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
-        socket.send(msgspec.msgpack.encode(camera))
-        kinds = told(socket, lambda kind: kind == "BackgroundImageMessage", 20)
-    assert "BackgroundImageMessage" in kinds
-    assert not any("Share" in kind for kind in kinds)
+    for _ in range(6):  # by chance, viser may call back for the first message too
+        with window(viewer.port) as socket:
+            socket.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
+            told(socket, lambda kind: False, 0.1)
+            socket.send(msgspec.msgpack.encode(camera))
+            kinds = told(socket, lambda kind: kind == "BackgroundImageMessage", 15)
+        assert "BackgroundImageMessage" in kinds
+        assert not any("Share" in kind for kind in kinds)
     assert asked == []
 
 
