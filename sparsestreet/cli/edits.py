@@ -1,14 +1,19 @@
 """``edits=FILE``: a trained scene as a file of edits leaves it, and what its user should know of that."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.edits import Edits, edited, read_edits
+from sparsestreet.scene.edits.edits import off_the_ground
 from sparsestreet.scene.edits.file import Open
 from sparsestreet.scene.storage import StoredScene, load_scene
 from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_of
+
+_NOT_ON_IT = 1.0
+"""Meters between an object and the ground of which the user is told."""
 
 
 def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> StoredScene:
@@ -21,7 +26,7 @@ def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> 
 
     edits = read_edits(file, log_seconds(views), opener(stored))
     scene = edited(stored.scene, edits)
-    for note in _notes(edits):
+    for note in [*_notes(edits), *_heights(off_the_ground(stored.scene, edits))]:
         print(note)
     return replace(stored, scene=scene)
 
@@ -52,3 +57,12 @@ def _notes(edits: Edits) -> list[str]:
     if foreign := [name for name, one in edits.added.items() if one.scene is not None]:
         notes.append(f"{', '.join(foreign)}: lit as in the scene it comes from, without a shadow here")
     return notes
+
+
+def _heights(off: Mapping[str, float]) -> list[str]:
+    return [
+        f"{name} is {abs(meters):.1f} m {side} the ground: its path needs another z, or none"
+        for name, meters in off.items()
+        for side in ("above" if meters > 0 else "below",)
+        if abs(meters) > _NOT_ON_IT
+    ]
