@@ -22,6 +22,7 @@ from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_messa
 from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
 from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
 from sparsestreet.serving.turns import Turns
+from sparsestreet.types import View
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +32,8 @@ MOST_WAITING = 256
 """Requests at the same time; further ones get RESOURCE_EXHAUSTED."""
 _MOST_CAMERAS = 64
 """Of a batch."""
+_ELSEWHERE = 2.0
+"""Meters from all recorded cameras; farther away, pictures hold what none of them saw."""
 _LONGEST_DETAILS = 1000
 """Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
 _CODES = {
@@ -63,6 +66,7 @@ class Sensorsim:
         """``encoders``: threads that encode the pictures of batches."""
         self.scenes = scenes
         self._device = Turns()
+        self._guessed: set[str] = set()
         self._encoders = ThreadPoolExecutor(encoders, "encode")
 
     def render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
@@ -146,11 +150,23 @@ class Sensorsim:
     def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, Spent]:
         served: ServedScene = self.scenes.get(request.scene_id)
         view, edits = view_of(request, served.rig), edits_of(request, served)
+        self._note_guess(served, view)
         asked = time.perf_counter()
         with self._device.turn(partial(_check_wanted, context)):
             started = time.perf_counter()
             image = picture(served, view, edits)
         return image, Spent(1000 * (started - asked), 1000 * (time.perf_counter() - started))
+
+    def _note_guess(self, served: ServedScene, view: View) -> None:
+        """One line of the log for each scene, at the first picture from where no camera was."""
+        meters = served.rig.distance(view)
+        if meters > _ELSEWHERE and served.name not in self._guessed:
+            self._guessed.add(served.name)
+            log.warning(
+                "%s: a camera is %.1f m from where the log's were at that time; what none of them saw is a guess",
+                served.name,
+                meters,
+            )
 
 
 def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Server, int]:

@@ -4,6 +4,7 @@ import contextlib
 import io
 import threading
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -104,7 +105,9 @@ class Viewer:
         with self._lock:
             if client.client_id not in self._windows:  # closed meanwhile
                 return
-        client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY[shot.whole])
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # it closed just now
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY[shot.whole])
         ended = time.perf_counter()
         canvas.drawn(shot, ended - started, ended)
         refining = "" if shot.whole else "refining: "
