@@ -4,6 +4,8 @@ import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
 
 import cv2
 import grpc
@@ -65,6 +67,20 @@ def test_the_log_says_once_that_a_picture_from_elsewhere_is_a_guess(client, capl
     # 3 m of path, with turns of 9 degrees of a vehicle whose cameras are 1.5 m ahead of its axle.
     (said,) = re.findall(r"street: a camera is ([\d.]+) m from .* what none of them saw is a guess", caplog.text)
     assert 2.5 < float(said) < 3.5
+
+
+def test_the_client_of_the_page_gets_a_picture_and_the_interface(client, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "serving.md").read_text()
+    codes = re.findall(r"```python\n(.*?)```", page.partition("## In Python, without")[0], flags=re.S)
+    port = client.channel._channel.target().decode().rpartition(":")[2]
+    names: dict[str, Any] = {}
+    for code in codes:
+        exec(code.replace("127.0.0.1:50051", f"127.0.0.1:{port}"), names)
+    names["channel"].close()
+    seen = decoded(names["image"]).astype(int)
+    assert np.abs(seen - rendered(timed_views()[0])).max() <= 2  # two float32 poses one after the other
+    assert (tmp_path / "sensorsim.protoset").read_bytes() == wire.descriptor_set()
 
 
 def test_a_batch_is_its_singles_and_says_which_camera_failed(client):
