@@ -30,5 +30,5 @@ def export_artifact(
         0 if described is None else described.seed,
     )
     counts = write_artifact(out, served, views_of(run), provenance, car or DEFAULT_CAR)
-    said = ", ".join(f"{count} {what}" for what, count in counts.items())
+    said = ", ".join(f"{count} {what[:-1] if count == 1 else what}" for what, count in counts.items())
     print(f"{out}: scene {name!r} with {said}; sparsestreet serve {run} gives its pictures")

@@ -1,6 +1,6 @@
 """``edits=FILE``: a trained scene as a file of edits leaves it, and what its user should know of that."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -8,6 +8,7 @@ from pathlib import Path
 from sparsestreet.naming import one_line
 from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.edits import Edits, edited, read_edits
+from sparsestreet.scene.edits.edits import off_the_ground
 from sparsestreet.scene.edits.file import Open
 from sparsestreet.scene.edits.nodes import ALWAYS
 from sparsestreet.scene.edits.paths import Driven, Held, Moved
@@ -16,6 +17,8 @@ from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_
 
 _SAME = 1e-6
 """Of normalized time."""
+_NOT_ON_IT = 1.0
+"""Meters between an object and the ground of which the user is told."""
 
 
 def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> StoredScene:
@@ -28,7 +31,7 @@ def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> 
 
     edits = read_edits(file, log_seconds(views), opener(stored))
     scene = edited(stored.scene, edits)
-    for note in [*_notes(edits), *_late(edits, log_seconds(views))]:
+    for note in [*_notes(edits), *_late(edits, log_seconds(views)), *_heights(off_the_ground(stored.scene, edits))]:
         print(note)
     return replace(stored, scene=scene)
 
@@ -84,3 +87,12 @@ def _notes(edits: Edits) -> list[str]:
     if foreign := [name for name, one in edits.added.items() if one.scene is not None]:
         notes.append(f"{', '.join(map(one_line, foreign))}: lit as in the scene it comes from, without a shadow here")
     return notes
+
+
+def _heights(off: Mapping[str, float]) -> list[str]:
+    return [
+        f"{one_line(name)} is {abs(meters):.1f} m {side} the ground: its path needs another z, or none"
+        for name, meters in off.items()
+        for side in ("above" if meters > 0 else "below",)
+        if abs(meters) > _NOT_ON_IT
+    ]

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.cli.options import run_command
+from sparsestreet.listening import opened_at
 from sparsestreet.naming import one_line
 
 USAGE = """\
@@ -83,7 +84,8 @@ def _serve(request: ServeRequest) -> None:
         print(f"{one_line(name)}: cameras {cameras}")
     scenes.get(scenes.names[0])  # what is wrong with it is said now, and the first request need not wait
     server, port = start(scenes, request.host, request.port, request.workers)
-    print(f"serving {len(scenes.names)} scenes at {request.host}:{port}; Ctrl-C ends it", flush=True)
+    count = len(scenes.names)
+    print(f"serving {count} scene{'s'[: count > 1]} at {opened_at(request.host, port)}; Ctrl-C ends it", flush=True)
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.cli.options import run_command
+from sparsestreet.listening import Callers, opened_at
 
 USAGE = """\
 sparsestreet view RUN [key=value ...]     a trained street in the browser: fly, play, hide and move objects
@@ -21,6 +22,7 @@ sparsestreet view RUN [key=value ...]     a trained street in the browser: fly, 
   parts     [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
   host      whom it answers (default: 127.0.0.1, this machine alone); anybody who reaches it can use it
   port      default: 8080, or the next that is free
+  known_as  [street.lab,10.0.0.5]: further names of this machine by which browsers reach it, such as a proxy's
 """
 
 
@@ -36,6 +38,7 @@ class ViewRequest:
     device: str | None = None
     host: str = "127.0.0.1"
     port: int = 8080
+    known_as: tuple[str, ...] = ()
     parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -43,6 +46,7 @@ class ViewRequest:
             raise ValueError(f"fps lies in 1 to 60, got {self.fps:g}")
         if not 0 <= self.port < 2**16:
             raise ValueError(f"a port lies in 0 to 65535, got {self.port}")
+        Callers.of("127.0.0.1", self.known_as)
 
 
 def view(arguments: list[str]) -> int:
@@ -73,8 +77,9 @@ def _view(request: ViewRequest) -> None:
         port=request.port,
         frames_per_second=request.fps,
         save=request.save or file,
+        known_as=request.known_as,
     )
-    print(f"http://{request.host}:{viewer.port}  (Ctrl-C ends it)", flush=True)
+    print(f"http://{opened_at(request.host, viewer.port)}  (Ctrl-C ends it)", flush=True)
     try:
         viewer.run()
     except KeyboardInterrupt:

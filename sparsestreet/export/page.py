@@ -3,7 +3,10 @@
 import contextlib
 import io
 import math
+import threading
 from collections.abc import Sequence
+from functools import partial
+from http import HTTPStatus
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,6 +16,7 @@ import numpy as np
 from sparsestreet.atomic import atomic_file
 from sparsestreet.export.recording import Cloud, Part
 from sparsestreet.geometry.transforms import inverse
+from sparsestreet.listening import Callers
 from sparsestreet.types import View
 
 SKY_PART = "sky"
@@ -23,6 +27,12 @@ _SORTS_FROM_A_FILE = (
 )
 """Chromium starts no module worker out of a blob in a page that is a file, and says so only later. viser 1.1 sorts its
 clouds in one: they would be drawn unsorted. Where the blob is refused at once, its code takes a data URL instead."""
+_POLICY = (
+    '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; '
+    "script-src 'unsafe-inline' 'unsafe-eval' data: blob:; worker-src data: blob:; style-src 'unsafe-inline'; "
+    "img-src data: blob:; font-src data:; connect-src data: blob:; base-uri 'none'; form-action 'none'\">"
+)
+"""No network at all. viser unpacks its program into the page, compiles some, and starts workers at data: addresses."""
 _LOOK = 10.0
 """Meters to the point around which a viewer's camera turns."""
 
@@ -44,12 +54,13 @@ def write_page(
     """
     # viser records what a server would show; it says where that server is, which nobody needs to know.
     with contextlib.redirect_stdout(io.StringIO()):
-        server = viser_module().ViserServer(host="127.0.0.1", port=0, verbose=False)
+        server = private_server(None, host="127.0.0.1", port=0)
         try:
             page = _recorded(server, parts, seconds, start, dome)
         finally:
             server.stop()
     page = page.replace("<title>Viser</title>", f"<title>{_text(title)}</title>{_SORTS_FROM_A_FILE}", 1)
+    page = page.replace("<head>", f"<head>{_POLICY}", 1)
     with atomic_file(Path(path)) as temporary:
         temporary.write_text(page, encoding="utf-8")
 
@@ -63,6 +74,55 @@ def viser_module() -> ModuleType:
             "a page and the viewer need viser, which is not installed: pip install 'sparsestreet[viewer]'"
         ) from error
     return viser
+
+
+def private_server(callers: Callers | None, **options: Any) -> Any:
+    """Start viser's server, for pages of its own alone, and without its public tunnel: viser has options for neither.
+
+    Args:
+        callers: who is answered; None: nobody, where a scene is only recorded.
+        options: host, port and others of ``viser.ViserServer``.
+
+    Raises ImportError without viser, or for a version of it that starts its server another way.
+    """
+    viser, ready, guarded = viser_module(), threading.Event(), []
+    from websockets.asyncio import server as sockets
+
+    plain = sockets.serve
+
+    def serve(*arguments: Any, process_request: Any, **more: Any) -> Any:
+        guarded.append(process_request)
+        allowed = partial(_answer, callers, ready, process_request)
+        return plain(*arguments, process_request=allowed, **more)
+
+    sockets.serve = serve
+    try:
+        server = viser.ViserServer(verbose=False, **options)
+    finally:
+        sockets.serve = plain
+    try:
+        server._websock_server.unregister_handler(viser._messages.ShareUrlRequest)
+    except (AttributeError, AssertionError):
+        guarded.clear()
+    if not guarded:
+        server.stop()
+        raise ImportError(f"viser {viser.__version__} cannot be closed to foreign pages: pip install 'viser<1.2'")
+    ready.set()
+    return server
+
+
+def _answer(callers: Callers | None, ready: threading.Event, answer: Any, connection: Any, request: Any) -> Any:
+    """What viser answers to a request, unless it is refused: then nothing is opened."""
+    hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+    refusal = "this server answers nobody"
+    if callers is not None and ready.is_set():
+        refusal = callers.refusal(hosts, origins, connection.local_address[0])
+    if refusal is not None:
+        return connection.respond(HTTPStatus.FORBIDDEN, f"{refusal}\n")
+    response = answer(connection, request)
+    if response is not None:
+        response.headers["X-Frame-Options"] = "DENY"  # no foreign page may lay its own over it
+    return response
 
 
 def _recorded(server: Any, parts: Sequence[Part], seconds: Sequence[float], start: View, dome: Cloud | None) -> str:

@@ -25,7 +25,7 @@ from sparsestreet.scene.stored import check_numbers
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.cameras import Pose
 from sparsestreet.serving.renderer import frame_from_box
-from sparsestreet.serving.rig import Clock
+from sparsestreet.serving.rig import Rig, RigCamera
 from sparsestreet.serving.scenes import ServedScene
 
 DEFAULT_CAR = (4.8, 1.9, 1.6)
@@ -33,6 +33,8 @@ DEFAULT_CAR = (4.8, 1.9, 1.6)
 _REAR = 1.0
 _LEAST_FRAME_US = 1
 """AlpaSim asks for frames that end after they start."""
+_LONGEST_SHUTTER_US = 50_000
+"""That a simulation may ask for: AlpaSim's own are 15,000 to 30,000."""
 _FEWEST_POSES = 4
 """Of a track: AlpaSim draws a spline through them. Objects seen less often stay as they were recorded."""
 _WHEN = (1980, 1, 1, 0, 0, 0)
@@ -63,7 +65,7 @@ def write_artifact(
     Returns:
         How many ``poses``, ``cameras`` and ``objects`` there are.
 
-    Raises ValueError for a scene of less than two instants or with a number that is none, or a car that is none.
+    Raises ValueError for a drive that is too short to start in, a number that is none, or a car that is none.
     """
     if len(car) != 3 or min(car) <= 0:
         raise ValueError(f"car= is length, width and height in meters, got {list(car)}")
@@ -110,9 +112,7 @@ def _trajectories(served: ServedScene, views: RecordedViews, car: Sequence[float
                 "sequence_id": served.name,
                 "T_rig_world_timestamps_us": [rig.clock.microseconds(time) for time in rig.times],
                 "T_rig_worlds": rig.poses.tolist(),
-                "cameras_frame_timestamps_us": {
-                    key: _frames(views, camera.index, rig.clock) for key, camera in cameras.items()
-                },
+                "cameras_frame_timestamps_us": {key: _frames(views, camera, rig) for key, camera in cameras.items()},
                 "rig_bbox": {
                     "centroid": [length / 2 - _REAR, 0.0, height / 2],
                     "dim": [length, width, height],
@@ -123,17 +123,29 @@ def _trajectories(served: ServedScene, views: RecordedViews, car: Sequence[float
     }
 
 
-def _frames(views: RecordedViews, camera: int, clock: Clock) -> list[list[int]]:
-    """Start and end of the readout of each image of a camera."""
+def _frames(views: RecordedViews, camera: RigCamera, rig: Rig) -> list[list[int]]:
+    """Start and end of the readout of the images of a camera that AlpaSim may start with.
+
+    It asks for a picture that ends when the first of them does, at poses of up to ``_LONGEST_SHUTTER_US`` before. Those
+    that would need a pose before the first or after the last are left out: only recorded poses are written.
+    """
+    first, last = (rig.clock.microseconds(rig.times[index]) for index in (0, -1))
     frames = []
     for view in views.all:
-        if view.indices[1] == camera:
+        if view.indices[1] == camera.index:
             shutter = view.camera.shutter
             half = round(5e5 * shutter.seconds) if shutter is not None else 0
-            middle = clock.microseconds(view.time)
-            start = max(middle - half, 0)
-            frames.append([start, max(middle + half, start + _LEAST_FRAME_US)])
-    return frames
+            middle = rig.clock.microseconds(view.time)
+            end = middle + half
+            if first + _LONGEST_SHUTTER_US <= end <= last:
+                frames.append([min(middle - half, end - _LEAST_FRAME_US), end])
+    if not frames:
+        raise ValueError(
+            f"AlpaSim starts with an image {_LONGEST_SHUTTER_US // 1000} ms or more behind the first pose, and not "
+            f"behind the last, which is {(last - first) / 1000:g} ms behind it: camera {camera.name} has none, "
+            "train on more frames"
+        )
+    return sorted(frames)
 
 
 def _tracks(served: ServedScene) -> dict[str, Any]:

@@ -83,6 +83,12 @@ class Rig:
                 return one
         raise ValueError(f"there is no camera {name!r}, only {', '.join(one.name for one in self.cameras)}")
 
+    def distance(self, view: View) -> float:
+        """Return how far a view's camera is from the nearest that recorded at its time, meters."""
+        vehicle, place = self.at(view.time), view.camera.position.cpu().double().numpy()
+        recorded = [(vehicle @ one.rig_from_camera)[:3, 3] for one in self.cameras]
+        return min(float(np.linalg.norm(place - one)) for one in recorded)
+
     def view(self, name: str, world_from_rig: Pose, microseconds: int) -> View:
         """What a camera sees of the street from a vehicle that stands there, all of its pixels at once."""
         one = self.camera(name)

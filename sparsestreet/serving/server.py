@@ -17,12 +17,14 @@ import grpc
 
 import sparsestreet
 from sparsestreet.demand import as_demand
+from sparsestreet.listening import address, check_address
 from sparsestreet.records.provenance import this_source
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
 from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
 from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
 from sparsestreet.serving.turns import Turns
+from sparsestreet.types import View
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +36,8 @@ WHOLE_MESSAGE = 60.0
 """Seconds within which the message of a call must have come; a call without one holds a place of all."""
 _MOST_CAMERAS = 64
 """Of a batch."""
+_ELSEWHERE = 2.0
+"""Meters from all recorded cameras; farther away, pictures hold what none of them saw."""
 _LONGEST_DETAILS = 1000
 """Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
 _CODES = {
@@ -66,6 +70,7 @@ class Sensorsim:
         """``encoders``: threads that encode the pictures of batches."""
         self.scenes = scenes
         self._device = Turns()
+        self._guessed: set[str] = set()
         self._encoders = ThreadPoolExecutor(encoders, "encode")
 
     def render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
@@ -152,11 +157,23 @@ class Sensorsim:
     def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, Spent]:
         served: ServedScene = self.scenes.get(request.scene_id)
         view, edits = view_of(request, served.rig), edits_of(request, served)
+        self._note_guess(served, view)
         asked = time.perf_counter()
         with self._device.turn(partial(_check_wanted, context)):
             started = time.perf_counter()
             image = picture(served, view, edits)
         return image, Spent(1000 * (started - asked), 1000 * (time.perf_counter() - started))
+
+    def _note_guess(self, served: ServedScene, view: View) -> None:
+        """One line of the log for each scene, at the first picture from where no camera was."""
+        meters = served.rig.distance(view)
+        if meters > _ELSEWHERE and served.name not in self._guessed:
+            self._guessed.add(served.name)
+            log.warning(
+                "%s: a camera is %.1f m from where the log's were at that time; what none of them saw is a guess",
+                served.name,
+                meters,
+            )
 
 
 def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Server, int]:
@@ -170,6 +187,7 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
 
     Raises OSError where nobody can listen there.
     """
+    check_address(host, port)
     service = Sensorsim(scenes, encoders=workers)
     size = [(f"grpc.max_{way}_message_length", LARGEST_MESSAGE) for way in ("send", "receive")]
     # Two servers on one port would share its requests.
@@ -184,9 +202,9 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
     handlers.append(grpc.method_handlers_generic_handler("grpc.health.v1.Health", {"Check": health}))
     server.add_generic_rpc_handlers(tuple(handlers))
     try:
-        bound = server.add_insecure_port(f"{host}:{port}")
+        bound = server.add_insecure_port(address(host, port))
     except RuntimeError as error:
-        raise OSError(f"nobody can listen on {host}:{port}: another server may, choose another port=") from error
+        raise OSError(f"nobody can listen on {address(host, port)}: {error}") from error
     server.start()
     return server, bound
 

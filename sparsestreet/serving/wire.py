@@ -122,6 +122,21 @@ def kind(name: str) -> Any:
     return message_factory.GetMessageClass(_pool().FindMessageTypeByName(name if package else f"{PACKAGE}.{name}"))
 
 
+def descriptor_set() -> bytes:
+    """Return the interface as a ``FileDescriptorSet``, which protoc and grpcurl take in place of .proto files."""
+    files = descriptor_pb2.FileDescriptorSet(file=[_file(*one) for one in _PACKAGES.items()])
+    for name in SERVICES:
+        package, _, service = name.rpartition(".")
+        file = next((one for one in files.file if one.package == package), None) or files.file.add(
+            name=f"{package}.proto", package=package, dependency=[f"{one}.proto" for one in _PACKAGES], syntax="proto3"
+        )
+        made = file.service.add(name=service)
+        for call, kinds in METHODS.items():
+            asked, answered = (f".{kind}" if kind.startswith("common.") else f".{PACKAGE}.{kind}" for kind in kinds)
+            made.method.add(name=call, input_type=asked, output_type=answered)
+    return files.SerializeToString()
+
+
 @cache
 def number(enum: str, name: str) -> int:
     """The number of a name of an enum of SensorsimService.

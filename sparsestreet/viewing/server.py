@@ -4,11 +4,14 @@ import contextlib
 import io
 import threading
 import time
+import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sparsestreet.atomic import atomic_file
-from sparsestreet.export.page import look_from, viser_module
+from sparsestreet.export.page import look_from, private_server
+from sparsestreet.listening import Callers, bare, check_address
 from sparsestreet.types import View
 from sparsestreet.viewing.canvas import Canvas, Shot
 from sparsestreet.viewing.object_panel import ObjectPanel
@@ -26,14 +29,24 @@ class Viewer:
     """A stage on the web. ``run`` serves it until ``stop``; all windows show one time and the same edits."""
 
     def __init__(
-        self, stage: Stage, start: View, *, title: str, host: str, port: int, frames_per_second: float, save: Path
+        self,
+        stage: Stage,
+        start: View,
+        *,
+        title: str,
+        host: str,
+        port: int,
+        frames_per_second: float,
+        save: Path,
+        known_as: Sequence[str] = (),
     ) -> None:
+        """``known_as``: further names by which browsers reach it. Raises OSError where nobody can listen there."""
         self.stage, self.save, self.frames_per_second = stage, save, frames_per_second
+        check_address(host, 0)  # viser would try one port after the other
         # viser says where it is in a box of its own.
         with contextlib.redirect_stdout(io.StringIO()):
-            self.server = viser_module().ViserServer(host=host, port=port, label=title, verbose=False)
+            self.server = private_server(Callers.of(host, known_as), host=bare(host), port=port, label=title)
         look_from(self.server, start, far=1000.0)
-        # Sharing would ask a server of viser's makers for a public address.
         self.server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._windows: dict[int, tuple[Any, Canvas]] = {}
         self._lock, self._ended = threading.Lock(), threading.Event()
@@ -92,22 +105,30 @@ class Viewer:
         with self._lock:
             if client.client_id not in self._windows:  # closed meanwhile
                 return
-        client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY[shot.whole])
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Queued a .* on a closed connection")  # it closed just now
+            client.scene.set_background_image(image, format="jpeg", jpeg_quality=_QUALITY[shot.whole])
         ended = time.perf_counter()
         canvas.drawn(shot, ended - started, ended)
-        self._said.content = f"{shot.width} x {shot.height} in {1000 * (ended - started):.0f} ms"
+        refining = "" if shot.whole else "refining: "
+        self._said.content = f"{refining}{shot.width} x {shot.height} in {1000 * (ended - started):.0f} ms"
 
     def _joined(self, client: Any) -> None:
         canvas = Canvas(Pace(self.frames_per_second))
         with self._lock:
             self._windows[client.client_id] = client, canvas
 
-        @client.camera.on_update
-        def _(camera: Any) -> None:
+        looking = threading.Lock()  # viser calls from many threads: the last to look has to be the last to read
+
+        def seen(camera: Any) -> None:
             # Who rides along is where the log was: the window only answers.
-            eye = eye_of(camera)
-            if eye is not None and (not self._rides.value or canvas.eye is None):
-                canvas.look(eye, time.perf_counter())
+            with looking:
+                eye = eye_of(camera)
+                if eye is not None and (not self._rides.value or canvas.eye is None):
+                    canvas.look(eye, time.perf_counter())
+
+        client.camera.on_update(seen)
+        seen(client.camera)  # what it said when it joined: it need not say more
 
     def _left(self, client: Any) -> None:
         with self._lock:
@@ -118,7 +139,7 @@ class Viewer:
         with gui.add_folder("Time"):
             self._slider = gui.add_slider("seconds", 0.0, max(stage.duration, 0.01), 0.01, 0.0)
             self._plays = gui.add_checkbox("play", False)
-            self._said = gui.add_markdown("")
+            self._said = gui.add_markdown("loading")
 
         @self._slider.on_update
         def _(event: Any) -> None:

@@ -29,7 +29,7 @@ def test_a_server_serves_until_it_is_told_to_end(run):
         assert server.stdout is not None
         assert server.stdout.readline() == "street: cameras a, b, c, d\n"
         said = server.stdout.readline()
-        assert said.startswith("serving 1 scenes at 127.0.0.1:")
+        assert said.startswith("serving 1 scene at 127.0.0.1:")
         client = Client(int(said.partition("127.0.0.1:")[2].partition(";")[0]))
         assert client.render_rgb(theirs(request_for(timed_views()[0]))).image_bytes
         client.channel.close()

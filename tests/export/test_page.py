@@ -74,6 +74,10 @@ def test_the_page_is_named_and_needs_no_network(run, tmp_path):
     text = out.read_text()
     assert "<title>hand-made</title>" in text
     assert not re.findall(r"<(?:script|link|img)[^>]+(?:src|href)=[\"']?https?:", text)
+    # Before anything that it could forbid, and no address of a network is allowed.
+    said = re.search(r'<head><meta http-equiv="Content-Security-Policy" content="default-src \'none\'; ([^"]+)">', text)
+    assert said is not None
+    assert set(re.findall(r"[a-z]+:|\*|'self'", said[1])) == {"data:", "blob:"}
 
 
 def test_edits_are_honored(run, tmp_path, capsys):
@@ -102,15 +106,20 @@ def test_a_browser_draws_it_from_a_file_as_it_is_rendered(run, tmp_path):
         # The sorter of the clouds must answer: Chromium starts no module worker out of a blob in a page of a file.
         chromium.call(
             "Page.addScriptToEvaluateOnNewDocument",
-            source="window.sorted=0;const W=Worker;window.Worker=class extends W{constructor(...a){super(...a);"
+            source="window.forbidden=[];document.addEventListener('securitypolicyviolation',e=>"
+            "window.forbidden.push(e.violatedDirective+' '+e.blockedURI));window.sorted=0;"
+            "const W=Worker;window.Worker=class extends W{constructor(...a){super(...a);"
             "this.addEventListener('message',e=>{if(e.data.sortedIndices)window.sorted++})}}",
         )
         chromium.open(out.as_uri(), 480, 320)
-        chromium.wait("window.sorted > 0 && !!document.querySelector('canvas')")
+        chromium.wait("window.sorted > 0 && !!document.querySelector('canvas')", 150)
         time.sleep(3)  # the clouds fade in
+        assert chromium.run("window.forbidden.join()") == ""
+        chromium.run("fetch('http://127.0.0.1:9/').catch(() => 0)")
+        chromium.wait("window.forbidden.join() === 'connect-src http://127.0.0.1:9/'")
         shown = Image.open(io.BytesIO(chromium.picture())).convert("RGB")
         outside = [one for one in chromium.requests if not one.startswith(("file:", "data:", "blob:"))]
-    assert outside == []
+    assert outside in ([], ["http://127.0.0.1:9/"])  # the one that the page forbade
     rendered = stored_street().render(views[0]).rgb.clamp(0, 1).numpy()
     # Below the note that says that no GPU draws.
     error = np.asarray(shown, np.float64)[200:] / 255 - rendered[200:]

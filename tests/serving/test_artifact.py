@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,10 @@ from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.artifact import Provenance, write_artifact
 from sparsestreet.serving.renderer import edits_of, picture, view_of
+from sparsestreet.serving.rig import rig_of
+from sparsestreet.serving.scenes import ServedScene
+from sparsestreet.types import Shutter
+from tests.export.street import stored_street, street_views
 from tests.serving.street import START_US, STEP_US, place, request_for, served, timed_views
 
 FROM = Provenance("1234", "abcd", 0)
@@ -75,7 +80,7 @@ def test_the_drive_is_that_of_the_rig(archive, street):
     assert [one["logical_sensor_name"] for one in said["camera_calibrations"].values()] == ["0", "1", "2", "3"]
     assert drive["cameras_frame_timestamps_us"].keys() == said["camera_calibrations"].keys()
     for frames in drive["cameras_frame_timestamps_us"].values():
-        assert [start for start, _ in frames] == [START_US + STEP_US * frame for frame in range(5)]
+        assert [end for _, end in frames] == [START_US + STEP_US * frame for frame in range(1, 5)]
         assert all(end > start for start, end in frames)
     assert drive["rig_bbox"]["dim"] == [4.8, 1.9, 1.6]
     assert drive["rig_bbox"]["centroid"] == pytest.approx([1.4, 0.0, 0.8])
@@ -107,4 +112,55 @@ def test_equal_scenes_give_equal_bytes(archive, street, tmp_path):
 def test_a_car_that_is_none(street, tmp_path):
     with pytest.raises(ValueError, match="length, width and height"):
         write_artifact(tmp_path / "a.usdz", street, VIEWS, FROM, car=(1.0, 2.0))
+    assert not list(tmp_path.iterdir())
+
+
+def apart(
+    frames: int, rate: float, stamped: bool, readout: float, later: float = 0.04
+) -> tuple[ServedScene, RecordedViews]:
+    """A log whose second camera fires ``later`` seconds after the first; rows are read in ``readout`` seconds."""
+    whole = (frames - 1) / rate + abs(later)
+    views = []
+    for view in street_views(cameras=(0, 1))[: 2 * frames]:
+        seconds = view.indices[0] / rate + later * view.indices[1] - min(later, 0.0)
+        shutter = Shutter(torch.zeros(3), torch.zeros(3), seconds=readout) if readout else None
+        camera = replace(view.camera, shutter=shutter)
+        clock = {"seconds": seconds, "stamp": 1000 * START_US + round(1e9 * seconds)} if stamped else {}
+        views.append(replace(view, time=seconds / whole, camera=camera, **clock))
+    recorded = RecordedViews(tuple(views), (), None if stamped else rate)
+    return ServedScene("apart", stored_street(), rig_of(recorded, None, frame_rate=rate)), recorded
+
+
+@pytest.mark.parametrize("stamped", [True, False], ids=["clock", "no clock"])
+@pytest.mark.parametrize(
+    ("frames", "rate", "readout", "later"),
+    [(3, 10.0, 0.0, 0.04), (2, 2.0, 0.0, 0.0), (4, 30.0, 0.0, 0.04), (5, 10.0, 0.03, 0.04), (3, 2.0, 0.03, -0.04)],
+)
+def test_a_rollout_may_start_at_any_frame_with_any_shutter(stamped, frames, rate, readout, later, tmp_path):
+    """AlpaSim asks for the pose at the end of a frame, and up to a shutter's duration before."""
+    served, views = apart(frames, rate, stamped, readout, later)
+    write_artifact(tmp_path / "a.usdz", served, views, FROM)
+    with zipfile.ZipFile(tmp_path / "a.usdz") as found:
+        (drive,) = json.loads(found.read("rig_trajectories.json"))["rig_trajectories"]
+    stamps = drive["T_rig_world_timestamps_us"]
+    assert stamps == sorted(set(stamps))
+    assert len(drive["cameras_frame_timestamps_us"]) == 2
+    for number, listed in enumerate(drive["cameras_frame_timestamps_us"].values()):
+        assert listed == sorted(listed)
+        for start, end in listed:
+            assert start < end
+            assert all(stamps[0] <= end - shutter <= stamps[-1] for shutter in range(0, 50_001, 10_000))
+        # Every image but those at both ends is one to start with.
+        ends = [end for _, end in listed]
+        for frame in range(frames):
+            middle = stamps[0] + round(1e6 * (frame / rate + later * number))
+            inside = stamps[0] + 50_000 <= middle + 5e5 * readout <= stamps[-1]
+            assert inside == any(abs(end - middle - 5e5 * readout) <= 1 for end in ends)
+
+
+@pytest.mark.parametrize(("rate", "readout", "camera"), [(30.0, 0.0, 0), (10.0, 0.0, 1), (2.0, 0.03, 0)])
+def test_a_log_that_is_too_short_to_start_in_says_so(rate, readout, camera, tmp_path):
+    served, views = apart(2, rate, True, readout)
+    with pytest.raises(ValueError, match=f"50 ms or more behind the first pose.*camera {camera} has none, train on"):
+        write_artifact(tmp_path / "a.usdz", served, views, FROM)
     assert not list(tmp_path.iterdir())

@@ -1,8 +1,10 @@
 """The server over a loopback, called by a client that was made of AlpaSim's messages."""
 
+import re
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -55,6 +57,33 @@ def test_the_same_calls_by_nurecs_newer_name(client):
     newer = Client(int(client.channel._channel.target().decode().rpartition(":")[2]), "sensorsim.SensorsimService")
     with newer.channel:
         assert newer.render_rgb(theirs(request_for(view))).image_bytes == picture(client, view)
+
+
+def test_the_log_says_once_that_a_picture_from_elsewhere_is_a_guess(client, caplog):
+    """Beside the street, and on the recorded path where the log's cameras were half a second earlier or later."""
+    first, later = timed_views()[0], timed_views()[12]
+    picture(client, later)
+    assert "guess" not in caplog.text
+    elsewhere = request_for(first, frame_start_us=START_US + 3 * STEP_US, frame_end_us=START_US + 3 * STEP_US)
+    for _ in range(2):
+        client.render_rgb(theirs(elsewhere))
+    # 3 m of path, with turns of 9 degrees of a vehicle whose cameras are 1.5 m ahead of its axle.
+    (said,) = re.findall(r"street: a camera is ([\d.]+) m from .* what none of them saw is a guess", caplog.text)
+    assert 2.5 < float(said) < 3.5
+
+
+def test_the_client_of_the_page_gets_a_picture_and_the_interface(client, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).parents[2] / "docs" / "serving.md").read_text()
+    codes = re.findall(r"```python\n(.*?)```", page.partition("## In Python, without")[0], flags=re.S)
+    port = client.channel._channel.target().decode().rpartition(":")[2]
+    names: dict[str, Any] = {}
+    for code in codes:
+        exec(code.replace("127.0.0.1:50051", f"127.0.0.1:{port}"), names)
+    names["channel"].close()
+    seen = decoded(names["image"]).astype(int)
+    assert np.abs(seen - rendered(timed_views()[0])).max() <= 2  # two float32 poses one after the other
+    assert (tmp_path / "sensorsim.protoset").read_bytes() == wire.descriptor_set()
 
 
 def test_a_batch_is_its_singles_and_says_which_camera_failed(client):

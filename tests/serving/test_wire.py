@@ -107,3 +107,22 @@ def test_messages_are_those_of_alpasims_own_files(file, package):
     simple = {(home, None if kind in SCALARS else kind.split(".")[-1], name, n) for home, kind, name, n in theirs}
     assert len(simple) > 20
     assert simple == ours
+
+
+def test_the_interface_as_a_file_holds_the_messages_and_both_services():
+    """As protoc and grpcurl read it: each file after those that it needs."""
+    from google.protobuf import descriptor_pb2, descriptor_pool
+
+    pool = descriptor_pool.DescriptorPool()
+    for file in descriptor_pb2.FileDescriptorSet.FromString(wire.descriptor_set()).file:
+        pool.Add(file)
+    messages = [pool.FindFileContainingSymbol(f"{wire.PACKAGE}.PosePair"), pool.FindFileContainingSymbol("common.Pose")]
+    for found, theirs in zip(messages, (pb2.DESCRIPTOR, common_pb2.DESCRIPTOR), strict=True):
+        assert file_facts(found) == file_facts(theirs)
+    wanted = {
+        one.name: (one.input_type.full_name, one.output_type.full_name)
+        for one in pb2.DESCRIPTOR.services_by_name["SensorsimService"].methods
+    }
+    for name in wire.SERVICES:
+        service = pool.FindServiceByName(name)
+        assert {one.name: (one.input_type.full_name, one.output_type.full_name) for one in service.methods} == wanted

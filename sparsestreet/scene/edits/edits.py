@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
+import torch
+
 from sparsestreet.naming import nearest, one_line
 from sparsestreet.scene.edits.nodes import ALWAYS, AddedObject, Change, EditedNode, recorded_frames
-from sparsestreet.scene.edits.paths import AsRecorded, Frame, Held, Moved, Recorded
+from sparsestreet.scene.edits.paths import AsRecorded, Driven, Frame, Held, Moved, Recorded
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.nodes.rigid import Rigid
@@ -13,6 +15,11 @@ from sparsestreet.scene.nodes.tracked import Tracked
 
 Object = tuple[str, Tracked, int]
 """Name of a node, the node, and the number of one of its objects."""
+
+_LOW = 0.2
+"""Of the heights around a place: that of the ground, beside what grows or stands on it."""
+_ENOUGH = 5
+"""Gaussians around a place to tell the ground's height by."""
 
 REMOVED = Change(hidden=(ALWAYS,))
 
@@ -53,7 +60,7 @@ def edited(scene: SceneGraph, edits: Edits) -> SceneGraph:
     Raises ValueError for an object that the scene has not, or a new one of a name that is taken.
     """
     objects = objects_of(scene)
-    added = {name: _added(objects, name, one) for name, one in edits.added.items()}
+    added = {name: _added(scene, objects, name, one) for name, one in edits.added.items()}
     in_place: dict[str, dict[int, Change]] = {}
     for name, change in edits.changes.items():
         node_name, node, instance = found(objects, name)
@@ -90,17 +97,68 @@ def found(objects: Mapping[str, Object], name: str) -> Object:
     return objects[name]
 
 
-def _added(objects: Mapping[str, Object], name: str, one: Added) -> AddedObject:
+def _added(scene: SceneGraph, objects: Mapping[str, Object], name: str, one: Added) -> AddedObject:
     if name in objects:
         raise ValueError(f"the scene has an object {name!r} already: give the new one another name")
-    _, source, instance = found(objects if one.scene is None else objects_of(one.scene), one.of)
+    try:
+        _, source, instance = found(objects if one.scene is None else objects_of(one.scene), one.of)
+    except ValueError as error:
+        raise ValueError(f"{name!r} is made of another object: {error}") from error
     change = one.change if one.change.path is not None else replace(one.change, path=AsRecorded())
+    if one.scene is not None and isinstance(change.path, Driven) and change.path.heights is None:
+        change = replace(change, path=_on_the_ground(scene, name, change.path, source.frame_height(instance)))
     recorded = recorded_frames(source, instance)
     if one.instead_of is not None:
         recorded = _on_the_same_ground(source, instance, *found(objects, one.instead_of)[1:])
     elif one.scene is not None and isinstance(change.path, AsRecorded | Moved | Held):
         raise ValueError(f"{name!r} comes from another scene, where its recorded way belongs: give it a way of its own")
     return AddedObject(name, source, instance, change, recorded, to_source=lambda time: one.speed * time)
+
+
+def ground_below(scene: SceneGraph, x: float, y: float) -> float | None:
+    """Return the height of the ground at a place of the world, meters; None where nothing stands still within 8 m.
+
+    It is that of the lowest opaque Gaussians of nodes without tracks, in the smallest circle that has enough of them.
+    """
+    rows = [node.rows for node in scene.nodes.values() if not isinstance(node, Tracked | EditedNode | AddedObject)]
+    if not rows:
+        return None
+    means = torch.cat([one.means.detach()[one.opacity_logits.detach() > 0] for one in rows])
+    away = torch.linalg.vector_norm(means[:, :2] - means.new_tensor([x, y]), dim=1)
+    for radius in (1.0, 2.0, 4.0, 8.0):
+        near = means[away < radius, 2]
+        if len(near) >= _ENOUGH:
+            return float(near.quantile(_LOW))
+    return None
+
+
+def off_the_ground(scene: SceneGraph, edits: Edits) -> dict[str, float]:
+    """Return how far objects on ways of their own stand above the ground (below: negative), where most; meters.
+
+    Left out are those for which nobody knows.
+    """
+    objects = objects_of(scene)
+    ways = {name: (found(objects, name), change.path) for name, change in edits.changes.items()}
+    for name, one in edits.added.items():
+        ways[name] = found(objects if one.scene is None else objects_of(one.scene), one.of), one.change.path
+        if one.scene is not None and isinstance(one.change.path, Driven) and one.change.path.heights is None:
+            del ways[name]  # it is set on the ground
+    off: dict[str, float] = {}
+    for name, ((_, node, instance), path) in ways.items():
+        if isinstance(path, Driven):
+            recorded = recorded_frames(node, instance)
+            places = [path.frame(time, recorded)[:3, 3].tolist() for time in path.times]
+            grounds = [(z - node.frame_height(instance), ground_below(scene, x, y)) for x, y, z in places]
+            heights = [feet - ground for feet, ground in grounds if ground is not None]
+            off |= {name: max(heights, key=abs)} if heights else {}
+    return off
+
+
+def _on_the_ground(scene: SceneGraph, name: str, path: Driven, height: float) -> Driven:
+    grounds = [ground_below(scene, x, y) for x, y in path.positions]
+    if missing := [place for place, ground in zip(path.positions, grounds, strict=True) if ground is None]:
+        raise ValueError(f"nothing stands still within 8 m of {missing[0]}, where {name!r} goes: say z in its path")
+    return replace(path, heights=[height + ground for ground in grounds if ground is not None])
 
 
 def _on_the_same_ground(source: Tracked, instance: int, other: Tracked, other_instance: int) -> Recorded:

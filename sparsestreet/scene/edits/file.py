@@ -9,7 +9,7 @@ import yaml
 
 from sparsestreet.naming import nearest, one_line
 from sparsestreet.safe_yaml import read_yaml
-from sparsestreet.scene.edits.edits import REMOVED, Added, Edits
+from sparsestreet.scene.edits.edits import REMOVED, Added, Edits, found, objects_of
 from sparsestreet.scene.edits.nodes import Change
 from sparsestreet.scene.edits.paths import AsRecorded, Driven, Held, Moved, Path
 from sparsestreet.scene.storage import StoredScene
@@ -35,7 +35,7 @@ def read_edits(path: FilePath | str, seconds: float, open_scene: Open) -> Edits:
           car_8: {hold: 2.0}                       # as it was after 2 s
           car_9: {path: [[0, 5.0, -2.0], [3, 20.0, -2.0]]}   # seconds, x, y and, if they are given, z and yaw
         copy: {second: {of: car_7, forward: -8}}
-        insert: {walker: {scene: outputs/OTHER, of: pedestrian_02, path: [[0, 12.0, 1.0, 0.9, 90]]}}
+        insert: {walker: {scene: outputs/OTHER, of: pedestrian_02, path: [[0, 12.0, 1.0], [4, 12.0, 6.0]]}}
         replace: {car_5: {scene: outputs/OTHER, of: car_1}}
 
     Raises FileNotFoundError where there is no file, ValueError, naming file and entry, for what is wrong in it.
@@ -112,7 +112,12 @@ def _of_scene(entry: Mapping[str, Any], open_scene: Open, clock: _Clock, where: 
     of, change = _text(entry, "of", where), _change(entry, clock, where)
     if "scene" not in entry:
         return Added(of, change, instead_of)
-    stored, seconds = open_scene(FilePath(_text(entry, "scene", where)))
+    path = _text(entry, "scene", where)
+    stored, seconds = open_scene(FilePath(path))
+    try:
+        found(objects_of(stored.scene), of)
+    except ValueError as error:
+        raise ValueError(f"{where}: in {path}: {error}") from error
     return Added(of, change, instead_of, stored.scene, speed=clock.seconds / seconds)
 
 

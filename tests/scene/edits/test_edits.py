@@ -20,11 +20,14 @@ from sparsestreet.scene.edits import (
     edited,
     placed,
 )
+from sparsestreet.scene.edits.edits import off_the_ground
+from sparsestreet.scene.edits.nodes import AddedObject
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Tracked
 from sparsestreet.types import Shutter
 from tests.scene.people import smpl, walker
 from tests.scene.stored import NAMES, cars, pixels, stored, view
+from tests.scene.street import background, random_rows
 
 TIME = 0.37
 TRAM, CAR = NAMES
@@ -223,6 +226,50 @@ def test_a_person_stands_on_the_ground_that_another_stood_on(people):
     assert 0.75 < node.frame_height(0) < 1.0
 
 
+def hillside() -> SceneGraph:
+    """A slope far from the world's zero, with a wall, leaves above it, a faint cloud below, and a car that moves."""
+    generator = torch.Generator().manual_seed(3)
+    rows = random_rows(1000, 0)
+    with torch.no_grad():
+        rows.means[:, :2] = 30 * torch.rand(1000, 2, generator=generator) + torch.tensor([50.0, -20.0])
+        rows.means[:, 2] = slope(*rows.means[:, :2].T)
+        rows.means[:300, 2] += 1 + 4 * torch.rand(300, generator=generator)
+        rows.opacity_logits.fill_(2.0)
+        rows.means[300:400, 2] -= 3
+        rows.opacity_logits[300:400] = -3.0
+    return SceneGraph({"hill": background(rows), "cars": cars()}).eval()
+
+
+def slope(x, y):
+    return -1.65 + 0.1 * (x - 50) + 0.05 * y
+
+
+def test_an_inserted_object_without_a_height_stands_on_the_ground_below(people):
+    hill, other = hillside(), SceneGraph({"people": smpl(walker("carl", height=1.2))}).eval()
+    source = other.nodes["people"]
+    assert isinstance(source, Tracked)
+    pelvis = source.frame_height(0)
+    way = Driven([0.0, 1.0], [(55.0, -10.0), (70.0, 2.0)])
+    edits = Edits(added={"carl": Added("carl", Change(way), scene=other)})
+    there = edited(hill, edits).nodes["carl"]
+    assert isinstance(there, AddedObject)
+    for time, place in ((0.0, (55.0, -10.0)), (1.0, (70.0, 2.0)), (0.5, (62.5, -4.0))):
+        frame = there.change.path.frame(time, there.recorded)
+        assert frame[2, 3] - pelvis == pytest.approx(slope(*place), abs=0.15)  # the ground is told from a circle of 1 m
+    assert off_the_ground(hill, edits) == {}
+    # As the world's zero is that of the first camera: the height of a pelvis over it is meters over the road.
+    high = Edits({CAR: Change(replace(way, heights=[-9.0, 5.0]))}, {
+        "carl": Added("carl", Change(replace(way, heights=[0.9, 0.9])), scene=other),
+        "sent away": Added(TRAM, Change(Driven([0.0], [(500.0, 0.0)], heights=[0.0]))),
+    })  # fmt: skip
+    off = off_the_ground(hill, high)
+    assert off == {"carl": pytest.approx(0.9 - pelvis - slope(55, -10), abs=0.15), CAR: pytest.approx(-8.35, abs=0.2)}
+    with pytest.raises(
+        ValueError, match=r"nothing stands still within 8 m of \(500.0, 0.0\), where 'carl' goes: say z"
+    ):
+        edited(hill, Edits(added={"carl": Added("carl", Change(Driven([0.0], [(500.0, 0.0)])), scene=other)}))
+
+
 def test_a_held_person_stops_walking_and_a_copied_one_walks_on(people):
     anna = people.nodes["people"].rows.instances.numpy() == 0
     there = edited(people, Edits({"anna": Change(Held(0.25))}, {"twin": Added("anna", Change(Moved(right=1.0)))}))
@@ -252,6 +299,8 @@ def test_wrong_names_are_named(scene):
     with pytest.raises(ValueError, match=r"no object 'xxx.*xxx\.\.\.': the nearest names are ") as told:
         edited(scene, Edits({"x" * (16 << 20): REMOVED}))  # difflib would take seconds
     assert len(str(told.value)) < 300
+    with pytest.raises(ValueError, match="'new' is made of another object: the scene has no object 'tram 13'"):
+        edited(scene, Edits(added={"new": Added("tram 13")}))
     with pytest.raises(ValueError, match="has an object 'tram 12' already"):
         edited(scene, Edits(added={TRAM: Added(CAR)}))
     with pytest.raises(ValueError, match="node of the scene is named 'road'"):

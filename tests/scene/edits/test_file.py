@@ -102,6 +102,11 @@ def test_other_scenes_are_looked_for_beside_the_file(tmp_path, other):
         ("move: {a: {path: [[1, 1, 2], [0, 2, 3]]}}", "increasing times"),
         ("move: {a: {path: 5}}", r"is a list of \[seconds, x, y\]"),
         ("copy: {a: {right: 2}}", "copy: a: of: is missing"),
+        (
+            "insert: {a: {scene: there, of: cow, path: [[0, 1, 2]]}}",
+            "insert: a: in there: the scene has no object 'cow'",
+        ),
+        ("replace: {a: {scene: there, of: cow}}", "replace: a: in there: the scene has no object 'cow'"),
         ("{remove: [a], hide: {a: [0, 1]}}", "a is edited twice"),
         ("remove: [a", "is no YAML"),
         (f"remove: [{'9' * 5000}]", r"is no YAML that can be read: Exceeds the limit"),
