@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor
 
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, check_image_sizes, read_image, read_mask
+from sparsestreet.data.images import check_camera_images, check_image_sizes, joined, mask_notes, read_image, read_mask
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import Problem, attempt, fault, missing_files
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
@@ -113,8 +114,11 @@ def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, 
             attempt(problems, partial(check_rigid, image.world_from_camera, table, f"the pose of {image.name}"))
             placed.append((table, image.world_from_camera[:3, 3]))
     if masks is not None:
-        stems = ((name, image.path.stem) for instant in images.instants for name, image in instant.items())
-        problems += GivenMasks(Path(masks)).check(stems)
+        given = GivenMasks(Path(masks))
+        problems += given.check((name, image.path.stem) for instant in images.instants for name, image in instant.items())
+        for name, (_, size) in images.cameras.items() if decode else ():
+            stems = [(name, instant[name].path.stem) for instant in images.instants if name in instant]
+            problems += given.check_pixels(stems, size)
     return problems or check_extent(placed)
 
 
@@ -149,7 +153,9 @@ def recording_of(
     ]
     given = None if reader.masks is None else GivenMasks(Path(reader.masks))
     kinds = given.kinds if given else frozenset[str]()
-    has_own = any(image.valid for image in images.images)
+    valid = {name: [image.valid for each in images.instants if (image := each.get(name))] for name in images.cameras}
+    has_own = any(any(paths) for paths in valid.values())
+    guessed = chain.from_iterable(mask_notes(name, filter(None, paths[:1])) for name, paths in valid.items())
     return Recording(
         name=reader.folder.resolve().name,
         rig=rig,
@@ -158,7 +164,7 @@ def recording_of(
         read_masks=partial(_masks, rig, given),
         mask_kinds=kinds | {"ego"} if has_own else kinds,
         sparse_points=None if sparse_points is None else partial(_scaled_points, sparse_points, scale),
-        notes=(_note_of_scale(shots, scale), *notes),
+        notes=(_note_of_scale(shots, scale), *guessed, *notes),
     )
 
 
@@ -211,7 +217,7 @@ def _masks(rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: Shot) 
     if image.valid is not None:
         # The nearest pixel: between black and white nothing is valid in part.
         excluded = ~read_mask(image.valid, camera.size, sky=True, undistortion=camera.undistortion)
-        masks["ego"] = masks["ego"] | excluded if "ego" in masks else excluded
+        masks["ego"] = joined(masks.get("ego"), excluded)
     return masks
 
 

@@ -13,7 +13,7 @@ from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
 from sparsestreet.data.drivestudio.files import hashed_files
 from sparsestreet.data.drivestudio.flavors import FlavorName
-from sparsestreet.data.drivestudio.frames import read_frame, read_rig, read_views
+from sparsestreet.data.drivestudio.frames import pixel_notes, read_frame, read_rig, read_views
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
 from sparsestreet.data.drivestudio.poses import first_pose, read_clock, read_vehicle
@@ -120,7 +120,7 @@ class DriveStudioReader(LogReader):
             camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
             carried_without=folder.holding_out,
-            notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people),
+            notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people, *pixel_notes(layout)),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
             vehicle=VehiclePath(recentered(read_vehicle(layout), origin)) if layout.flavor.mounted else None,
         )

@@ -8,7 +8,7 @@ from pathlib import Path
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, check_image_sizes
+from sparsestreet.data.images import check_camera_images, check_image_sizes, mask_notes
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
@@ -75,7 +75,9 @@ class RigJsonReader(RecordedReader):
     def _notes(self, part: Part) -> tuple[str, ...]:
         window = frame_window(len(part.table.frames), self.first_frame, self.last_frame, self.folder)
         left_out = len(window) - len(part.places)
-        return (f"{left_out} of {len(window)} frames have no image and are left out",) if left_out else ()
+        masks = {name: part.table.cameras[name].ego_mask for name in part.cameras}
+        guessed = [note for name, mask in masks.items() if mask for note in mask_notes(name, [mask])]
+        return (*([f"{left_out} of {len(window)} frames have no image and are left out"] if left_out else []), *guessed)
 
     def _camera(self, part: Part, index: int) -> RigCamera[str]:
         name = part.cameras[index]
@@ -102,7 +104,11 @@ class RigJsonReader(RecordedReader):
             problems += [_no_pose(part, place) for place in unposed if part.table.frames[place].sweep is not None]
         if self.masks is not None:
             stems = [(part.cameras[shot.camera], shot.stem) for shot in shots]
-            problems += GivenMasks(Path(self.masks)).check(stems)
+            given = GivenMasks(Path(self.masks))
+            problems += given.check(stems)
+            for name in part.cameras if decode else ():
+                own = [(camera, stem) for camera, stem in stems if camera == name]
+                problems += given.check_pixels(own, part.table.cameras[name].size)
         return problems or check_extent([(part.table.path, shot.world_from_camera[:3, 3]) for shot in shots])
 
 
