@@ -4,11 +4,12 @@ What a pixel means depends on its type (Pillow's mode). ``COLORS`` and ``LEVELS`
 may have; whatever is not listed is an error, because Pillow would convert it to white or black.
 """
 
+import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,6 +21,8 @@ from torch import Tensor
 
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.undistortion import Undistortion
+
+logger = logging.getLogger(__name__)
 
 _JPEG_END = b"\xff\xd9"
 _PNG_END = b"IEND\xae\x42\x60\x82"
@@ -82,7 +85,7 @@ def check_pixels(path: Path, *, decode: bool) -> None:
 def check_camera_images(
     camera: str | int, images: Sequence[Path], masks: Iterable[Path], *, decode: bool
 ) -> list[Problem]:
-    """Problems of a camera's images and masks: all at the size of most of its images, of a type that is read, and whole.
+    """Problems of a camera's images and masks: at the size of most of its images, of a type that is read, whole.
 
     Files that are missing are passed over; ``decode`` as in ``check_pixels``.
     """
@@ -144,26 +147,12 @@ def image_notes(camera: str | int, images: Iterable[Path]) -> list[str]:
         for number, count in sorted(turned.items())
     ]
     if deep:
-        notes.append(f"{deep} images of camera {camera} have 16 bits a channel: 65535 is read as white, 8 bits are kept")
+        notes.append(f"{deep} images of camera {camera} have 16 bits a channel: 65535 is white, 8 bits are kept")
     if alpha:
         notes.append(
             f"{alpha} images of camera {camera} have alpha: pixels with less than half of it are not trained on and "
             "not measured"
         )
-    return notes
-
-
-def mask_notes(camera: str | int, masks: Iterable[Path]) -> list[str]:
-    """Say which masks are read by a guess, judged by some of them that are decoded here, such as the first of each
-    kind. Broken ones are passed over."""
-    notes = []
-    for path in filter(Path.is_file, masks):
-        found = attempt([], lambda path=path: _opened(path, partial(_split, path=path)))
-        if found is not None and found[1]:
-            notes.append(
-                f"masks of camera {camera} such as {path.parent.name}/{path.name} are not of two values, but of "
-                f"{found[1]} near black and white: split at the middle"
-            )
     return notes
 
 
@@ -189,7 +178,7 @@ def read_mask(
 
     Sky takes the nearest pixel; other masks keep every pixel an object touches (DriveStudio: bilinear, then > 0).
     """
-    mask, _ = _opened(path, partial(_split, path=path))
+    mask = _opened(path, partial(_split, path=path))
     return _mask_at(mask, size, Image.Resampling.NEAREST if sky else Image.Resampling.BILINEAR, undistortion)
 
 
@@ -272,11 +261,9 @@ LEVELS: dict[str, Callable[[Image.Image], np.ndarray]] = {
 """Types of pixels of masks -> how they become levels."""
 
 
-def _split(image: Image.Image, path: Path) -> tuple[Bool[np.ndarray, "h w"], int]:
-    """The pixels of a mask that are not black, and between how many levels the middle had to be taken; 0: between none.
-
-    Raises LogError for what is no mask: more than two levels, colors, or an alpha that differs.
-    """
+def _split(image: Image.Image, path: Path) -> Bool[np.ndarray, "h w"]:
+    """The pixels of a mask that are not black. Levels near black and white are split at the middle, which is logged
+    once a folder. Raises LogError for what is no mask: more than two levels, colors, or an alpha that differs."""
     mode, _ = _type(image)
     if mode not in LEVELS:
         raise fault(path, f"the mask has pixels of the type {mode}, which is not read", _MASK_REMEDY)
@@ -290,13 +277,29 @@ def _split(image: Image.Image, path: Path) -> tuple[Bool[np.ndarray, "h w"], int
     top = 65535 if mode == "I;16" else 255
     values = np.unique(levels) if top > 255 else np.flatnonzero(Image.fromarray(levels).histogram())
     if len(values) < 2 or (len(values) == 2 and not values[0]):
-        return levels > 0, 0
+        return levels > 0
     low, high = (values <= _OUTER * top).sum(), (values >= (1 - _OUTER) * top).sum()
     # Of a label map the numbers are low, and a single one, 255, may stand for what has no label.
     if low + high < len(values) or not high or (high == 1 < low and image.format not in _LOSSY):
         some = ", ".join(map(str, values[:5])) + (", ..." if len(values) > 5 else "")
         raise fault(path, f"the mask has {len(values)} values ({some}), not black and one other", _MASK_REMEDY)
-    return levels > top // 2, len(values)
+    _log_split(path.parent, path.name, len(values))
+    return levels > top // 2
+
+
+@lru_cache(maxsize=1024)
+def _said(folder: Path) -> list[str]:
+    """The first mask of a folder that was read by a guess."""
+    return []
+
+
+def _log_split(folder: Path, name: str, count: int) -> None:
+    said = _said(folder)
+    if not said:
+        said.append(name)
+        logger.warning(
+            "masks such as %s have %d levels near black and white: they are split at the middle", folder / name, count
+        )
 
 
 def _alpha(image: Image.Image) -> UInt8[np.ndarray, "h w"] | None:

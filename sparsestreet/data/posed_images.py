@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from pathlib import Path, PurePosixPath
 
 import torch
@@ -19,9 +18,9 @@ from torch import Tensor
 
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, check_image_sizes, joined, mask_notes, read_image, read_mask
+from sparsestreet.data.images import check_camera_images, check_image_sizes, joined, read_image, read_mask
 from sparsestreet.data.poses import check_rigid
-from sparsestreet.data.problems import Problem, attempt, fault, missing_files
+from sparsestreet.data.problems import Problem, attempt, fault, missing_files, missing_notes
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.window import chosen_cameras, frame_window
@@ -44,7 +43,7 @@ class PosedImage:
     """OpenCV's axes, the data set's own world and unit."""
     valid: Path | None = None
     """A mask that is black where the image is not to be used."""
-    time: float | None = None
+    time: float | int | None = None
     """When it was taken, in whatever unit."""
 
 
@@ -93,6 +92,16 @@ def sort_images(
     return PosedImages({name: kinds[name] for name in chosen}, [ordered[place] for place in window])
 
 
+def there(images: Sequence[PosedImage], table: Path) -> tuple[list[PosedImage], list[str]]:
+    """Return the images whose files are there, and what is said of the others, which ``table`` lists too. Raises
+    LogError where all are missing."""
+    found = [image for image in images if image.path.is_file()]
+    if not found:
+        message = f"none of the {len(images)} images that it lists is there, the first is {images[0].path}"
+        raise fault(table, message, "write the images, or name the folder that holds them")
+    return found, missing_notes(len(images) - len(found), len(images))
+
+
 def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, decode: bool) -> list[Problem]:
     """What is wrong with lenses, poses and files of images and masks; all pixels are looked at if ``decode``.
 
@@ -115,7 +124,9 @@ def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, 
             placed.append((table, image.world_from_camera[:3, 3]))
     if masks is not None:
         given = GivenMasks(Path(masks))
-        problems += given.check((name, image.path.stem) for instant in images.instants for name, image in instant.items())
+        problems += given.check(
+            (name, image.path.stem) for instant in images.instants for name, image in instant.items()
+        )
         for name, (_, size) in images.cameras.items() if decode else ():
             stems = [(name, instant[name].path.stem) for instant in images.instants if name in instant]
             problems += given.check_pixels(stems, size)
@@ -153,9 +164,7 @@ def recording_of(
     ]
     given = None if reader.masks is None else GivenMasks(Path(reader.masks))
     kinds = given.kinds if given else frozenset[str]()
-    valid = {name: [image.valid for each in images.instants if (image := each.get(name))] for name in images.cameras}
-    has_own = any(any(paths) for paths in valid.values())
-    guessed = chain.from_iterable(mask_notes(name, filter(None, paths[:1])) for name, paths in valid.items())
+    has_own = any(image.valid for image in images.images)
     return Recording(
         name=reader.folder.resolve().name,
         rig=rig,
@@ -164,7 +173,7 @@ def recording_of(
         read_masks=partial(_masks, rig, given),
         mask_kinds=kinds | {"ego"} if has_own else kinds,
         sparse_points=None if sparse_points is None else partial(_scaled_points, sparse_points, scale),
-        notes=(_note_of_scale(shots, scale), *guessed, *notes),
+        notes=(_note_of_scale(shots, scale), *notes),
     )
 
 
@@ -174,7 +183,7 @@ def natural(key: object) -> list[tuple[int, float, str]]:
     >>> sorted(["b10", "b9", "a"], key=natural)
     ['a', 'b9', 'b10']
     """
-    if isinstance(key, float):
+    if isinstance(key, (float, int)):
         return [(0, key, "")]
     parts = re.split(r"(\d+)", str(key))
     return [(0, float(part), part) if place % 2 else (1, 0.0, part) for place, part in enumerate(parts)]

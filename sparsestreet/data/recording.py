@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, image_notes, joined, mask_notes, read_transparent
+from sparsestreet.data.images import check_camera_images, image_notes, joined, read_transparent
 from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.data.motion import PosePath
@@ -28,7 +27,7 @@ from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.scene_folder import SceneFolder
-from sparsestreet.data.tracks import checked_track, timed_tracks, track_in_window
+from sparsestreet.data.tracks import checked_track, repeated, timed_tracks, track_in_window
 from sparsestreet.types import Frame, Shutter, SparsePoints, Track, View
 
 MASK_KINDS = ("sky", "human", "vehicle", "ego")
@@ -188,12 +187,10 @@ class RecordedReader(LogReader):
         return log_of(recording, cache_bytes=cache_bytes(self.cache_mb), check=self.check_contents)
 
     def _pixel_notes(self, recording: Recording) -> Iterator[str]:
-        """Of images, by their headers, and of the first of the user's own masks."""
+        """Of images, by their headers."""
         for camera in recording.rig:
             own = [shot for shot in recording.shots if shot.camera == camera.index]
             yield from image_notes(camera.name, [path for shot in own if (path := shot.path) is not None])
-            if self.masks is not None and own:
-                yield from mask_notes(camera.name, GivenMasks(Path(self.masks)).paths(camera.name, own[0].stem).values())
 
 
 def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[], list[Problem]]) -> DrivingLog:
@@ -210,6 +207,9 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
     origin = recording.shots[0].world_from_camera[:3, 3]
     recording = replace(recording, boxes=_filled(recording))
     boxes = [_checked(each) for each in recording.boxes or ()]
+    if twice := repeated([each.name for each in recording.boxes or ()]):
+        file = next(each.path for each in recording.boxes or () if each.name == twice)
+        raise fault(file, f"two objects are named {twice!r}", "give each object one name and one list of boxes")
     clock = _clock(recording, num_frames)
     views = [_view(shot, recording.rig, origin, clock) for shot in recording.shots]
     found = [track_in_window(track, range(num_frames), origin) for track in boxes]

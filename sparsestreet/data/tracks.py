@@ -1,5 +1,6 @@
 """Tracks of annotated objects: checked, cut to the frames that are read, and timed by the log's clock."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,11 @@ from sparsestreet.data.clock import LogClock
 from sparsestreet.data.poses import are_rigid, check_rigid, recentered
 from sparsestreet.data.problems import fault
 from sparsestreet.types import Track, View
+
+
+def repeated(names: Sequence[str]) -> str | None:
+    """Return the first name that stands twice; None where there is none."""
+    return next((name for name, count in Counter(names).items() if count > 1), None)
 
 
 def checked_track(

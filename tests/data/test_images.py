@@ -13,7 +13,6 @@ from sparsestreet.data.images import (
     check_camera_images,
     check_image_sizes,
     image_notes,
-    mask_notes,
     read_image,
     read_mask,
     read_transparent,
@@ -128,14 +127,14 @@ MASKS: dict[str, Callable[[], Image.Image]] = {
 
 
 @pytest.mark.parametrize("name", MASKS)
-def test_every_type_of_mask_covers_what_it_must(name, tmp_path):
+def test_every_type_of_mask_covers_what_it_must(name, tmp_path, caplog):
     path = saved(MASKS[name](), tmp_path / "mask.png")
     image = saved(Image.fromarray(RGB), tmp_path / "image.png")
     assert check_camera_images("front", [image], [path], decode=True) == []
     assert torch.equal(read_mask(path, SIZE, sky=True), torch.from_numpy(MASK))
     assert read_mask(path, (3, HEIGHT), sky=False).tolist() == [[True, True, False]] * 2 + [[False] * 3] * 3
-    notes = mask_notes("front", [path, tmp_path / "none.png"])
-    assert ["near black and white: split at the middle" in note for note in notes] == [True] * (
+    said = [record.message for record in caplog.records]
+    assert ["near black and white: they are split at the middle" in line for line in said] == [True] * (
         name in ("noise of an encoder", "dark white")
     )
 
@@ -167,13 +166,12 @@ def test_what_is_no_mask_is_refused_with_what_it_is(name, tmp_path):
         raise LogError(check_camera_images("front", [image], [path], decode=True))
 
 
-def test_a_jpeg_under_a_masks_name_is_split_at_the_middle(tmp_path):
+def test_a_jpeg_under_a_masks_name_is_split_at_the_middle(tmp_path, caplog):
     mask = np.zeros((48, 64), np.uint8)
     mask[8:40, 16:] = 255
     path = saved(Image.fromarray(np.clip(mask, 3, 250)), tmp_path / "mask.png", format="JPEG", quality=98)
     assert torch.equal(read_mask(path, (64, 48), sky=True), torch.from_numpy(mask > 0))
-    (note,) = mask_notes("front", [path])
-    assert "masks of camera front such as" in note
+    assert f"masks such as {path} have" in caplog.text
 
 
 @pytest.mark.parametrize("ending", ["jpg", "png", "webp"])

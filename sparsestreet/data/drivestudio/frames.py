@@ -8,7 +8,14 @@ from torch import Tensor
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout
 from sparsestreet.data.drivestudio.poses import read_image_stamps, read_intrinsics, world_from_camera
-from sparsestreet.data.images import image_notes, image_size, joined, mask_notes, read_image, read_mask, read_transparent
+from sparsestreet.data.images import (
+    image_notes,
+    image_size,
+    joined,
+    read_image,
+    read_mask,
+    read_transparent,
+)
 from sparsestreet.data.poses import recentered
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.types import Frame, View
@@ -67,8 +74,6 @@ def read_frame(layout: Layout, rig: Sequence[RigCamera[int]], view: View) -> Fra
 
 
 def pixel_notes(layout: Layout) -> Iterator[str]:
-    """What is done with unusual pixels of images, by their headers, and of the first mask of each kind."""
+    """What is done with unusual pixels of images, by their headers."""
     for camera in layout.cameras:
         yield from image_notes(camera, (layout.image(frame, camera) for frame in layout.frames))
-        masks = [*(layout.mask(kind, layout.frames[0], camera) for kind in MASK_KINDS), layout.ego_mask(camera)]
-        yield from mask_notes(camera, filter(None, masks))

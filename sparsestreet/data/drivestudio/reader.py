@@ -17,7 +17,7 @@ from sparsestreet.data.drivestudio.frames import pixel_notes, read_frame, read_r
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
 from sparsestreet.data.drivestudio.poses import first_pose, read_clock, read_vehicle
-from sparsestreet.data.drivestudio.sweeps import read_points
+from sparsestreet.data.drivestudio.sweeps import read_points, sweep_notes
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath
@@ -120,7 +120,13 @@ class DriveStudioReader(LogReader):
             camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
             carried_without=folder.holding_out,
-            notes=(*_notes(layout), *(camera.note for camera in rig if camera.note is not None), *people, *pixel_notes(layout)),
+            notes=(
+                *_notes(layout),
+                *(camera.note for camera in rig if camera.note is not None),
+                *people,
+                *pixel_notes(layout),
+                *sweep_notes(layout),
+            ),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
             vehicle=VehiclePath(recentered(read_vehicle(layout), origin)) if layout.flavor.mounted else None,
         )

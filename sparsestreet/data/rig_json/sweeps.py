@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.lidar import check_points
+from sparsestreet.data.lidar import check_points, returned
 from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.problems import fault
@@ -37,7 +37,8 @@ def read_sweep(
     mount = lidar.vehicle_from_lidar
     check_points(points - reference if mount is None else points, path)
     center = reference if mount is None else torch.zeros(3, dtype=torch.float64)
-    far = (points - center).norm(dim=-1) >= lidar.nearest
+    # Who writes the world's points of a driver's zeros either moves them to the sensor or leaves them.
+    far = ((points - center).norm(dim=-1) >= lidar.nearest) & returned(points - center) & returned(points)
     points = points[far]
     if mount is None:
         return points
