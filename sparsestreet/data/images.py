@@ -196,7 +196,8 @@ def colors(image: Image.Image, path: Path) -> Image.Image:
 
 def _type(image: Image.Image) -> tuple[str, bool]:
     """Pillow's mode of an image that is not loaded, one for all grays of 16 bits, and whether a channel has 16."""
-    raw = str(image.tile[0][3]) if image.tile else ""
+    tiles = getattr(image, "tile", [])
+    raw = str(tiles[0][3]) if tiles else ""
     deep = image.mode in _DEEP or "16" in raw
     return "I;16" if image.mode in _DEEP or (image.mode == "I" and deep) else image.mode, deep
 

@@ -34,7 +34,7 @@ def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "d
 
 def returned(points: Float64[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
     """Return which points, in the frame of their sensor, came back from something: all but those nearer than 1 mm."""
-    return points.norm(dim=-1) >= _NEAREST
+    return ~(points.norm(dim=-1) < _NEAREST)  # NaN is no zero: check_points names it
 
 
 def empty_notes(read: Callable[[Path], Float64[Tensor, "n 3"]], paths: Sequence[Path]) -> list[str]:

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, check_image_sizes, joined, read_image, read_mask
+from sparsestreet.data.images import check_camera_images, check_image_sizes, read_image, read_mask
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import Problem, attempt, fault, missing_files, missing_notes
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
@@ -177,7 +177,7 @@ def recording_of(
     )
 
 
-def natural(key: object) -> list[tuple[int, float, str]]:
+def natural(key: object) -> list[tuple[int, float | int, str]]:
     """Orders names as people count: 2 before 10. A time is a number.
 
     >>> sorted(["b10", "b9", "a"], key=natural)
@@ -226,7 +226,7 @@ def _masks(rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: Shot) 
     if image.valid is not None:
         # The nearest pixel: between black and white nothing is valid in part.
         excluded = ~read_mask(image.valid, camera.size, sky=True, undistortion=camera.undistortion)
-        masks["ego"] = joined(masks.get("ego"), excluded)
+        masks["ego"] = masks["ego"] | excluded if "ego" in masks else excluded
     return masks
 
 

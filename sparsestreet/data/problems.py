@@ -81,4 +81,4 @@ def check_missing(missing: str) -> None:
 
 def missing_notes(absent: int, total: int, what: str = "listed images") -> list[str]:
     """Say how many of ``total`` were left out; nothing where none was."""
-    return [f"{absent} of {total} {what} are missing and left out (data.log.missing=skip)"] if absent else []
+    return [f"{absent} of {total} {what} lack files and are left out (data.log.missing=skip)"] if absent else []

@@ -63,19 +63,21 @@ def checked_track(
     return Track(name, class_name, torch.from_numpy(frames.astype(np.int64)), torch.from_numpy(poses), size)
 
 
-def track_in_window(track: Track, frames: range, origin: Float64[Tensor, "3"]) -> Track | None:
-    """The track inside the window, frames counted from its start, in the re-centered world; None where it is absent.
+def track_in_window(track: Track, frames: Sequence[int], origin: Float64[Tensor, "3"]) -> Track | None:
+    """The track in these frames, which increase, counted by their places, in the re-centered world; None where it is
+    absent.
 
     The size stays the mean over all of the log: an object does not change with the window.
     """
-    inside = (track.frames >= frames.start) & (track.frames < frames.stop)
+    wanted = torch.tensor(frames)
+    inside = torch.isin(track.frames, wanted)
     if not inside.any():
         return None
     poses = recentered(track.world_from_object[inside], origin)
     body = None
     if track.body is not None:
         body = replace(track.body, rotations=track.body.rotations[inside], valid=track.body.valid[inside])
-    return replace(track, frames=track.frames[inside] - frames.start, world_from_object=poses, body=body)
+    return replace(track, frames=torch.searchsorted(wanted, track.frames[inside]), world_from_object=poses, body=body)
 
 
 def timed_tracks(

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
-from sparsestreet.data.drivestudio.files import hashed_files
+from sparsestreet.data.drivestudio.files import complete, hashed_files
 from sparsestreet.data.drivestudio.flavors import FlavorName
 from sparsestreet.data.drivestudio.frames import pixel_notes, read_frame, read_rig, read_views
 from sparsestreet.data.drivestudio.instances import read_instances
@@ -24,7 +24,7 @@ from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
-from sparsestreet.data.problems import LogError, Problem
+from sparsestreet.data.problems import LogError, Missing, Problem, check_missing, missing_notes
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.scene_folder import SceneFolder
 from sparsestreet.data.tracks import timed_tracks, track_in_window
@@ -68,10 +68,13 @@ class DriveStudioReader(LogReader):
     """Where the scene's box lies (``DrivingLog.first_axes``): "world" or "first_pose"."""
     flavor: FlavorName | None = None
     """The data set that the layout was made of; None: what the files tell, an error where they leave it open."""
+    missing: Missing = "error"
+    """skip: frames of which a file is missing are left out with a note."""
     cache_mb: CacheSize = "auto"
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
     def __post_init__(self) -> None:
+        check_missing(self.missing)
         if self.extent not in get_args(SceneExtent):
             raise ValueError(f"extent must be one of {', '.join(get_args(SceneExtent))}, got {self.extent!r}")
         if self.lidar_ahead is not None and not (
@@ -136,7 +139,7 @@ class DriveStudioReader(LogReader):
         return hashed_files(self._layout())
 
     def _layout(self) -> Layout:
-        return find_layout(
+        layout = find_layout(
             self.folder,
             cameras=self.cameras,
             first_frame=self.first_frame,
@@ -145,6 +148,7 @@ class DriveStudioReader(LogReader):
             bodies=self.bodies,
             flavor=self.flavor,
         )
+        return complete(layout) if self.missing == "skip" else layout
 
 
 def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[tuple[Track, ...], tuple[str, ...]]:
@@ -166,7 +170,8 @@ def _notes(layout: Layout) -> tuple[str, ...]:
         boxes=layout.has_instances,
         clock=layout.has_clock,
     )
-    return (*_note_of_flavor(layout), *absent)
+    skipped = missing_notes(layout.absent, layout.absent + len(layout.frames), "frames")
+    return (*skipped, *_note_of_flavor(layout), *absent)
 
 
 def _note_of_flavor(layout: Layout) -> list[str]:

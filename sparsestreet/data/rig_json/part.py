@@ -10,7 +10,7 @@ from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import joined, read_image, read_mask
+from sparsestreet.data.images import read_image, read_mask
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.recording import Boxes, LidarSweep, Shot
 from sparsestreet.data.rig import RigCamera
@@ -146,7 +146,7 @@ def read_masks(
         masks = given.read(camera.name, shot.stem, recorded_size=entry.size, size=camera.size, undistortion=lens)
     if entry.ego_mask is not None:
         ego = read_mask(entry.ego_mask, camera.size, sky=False, undistortion=lens)
-        masks["ego"] = joined(masks.get("ego"), ego)
+        masks["ego"] = masks["ego"] | ego if "ego" in masks else ego
     return masks
 
 
