@@ -44,7 +44,7 @@ def doubts(log: DrivingLog, frames: Frames | None = None) -> tuple[str, ...]:
 
 
 def _covered(frames: Frames, names: Sequence[str]) -> Iterator[str]:
-    seen, flat, used = Counter[int](), Counter[int](), defaultdict[int, float](float)
+    seen, flat, blind, used = Counter[int](), Counter[int](), Counter[int](), defaultdict[int, float](float)
     for place in spread(len(frames), MOST_FRAMES):
         frame = frames[place]
         camera = frame.indices[1]
@@ -52,12 +52,19 @@ def _covered(frames: Frames, names: Sequence[str]) -> Iterator[str]:
         seen[camera] += 1
         share = used_share(frame)
         used[camera] += share
+        blind[camera] += not share
         gray = gray if frame.ego is None else gray[~frame.ego]
         flat[camera] += share > 0 and float(gray.std(correction=0)) < _FLAT
     for camera in (camera for camera in sorted(seen) if used[camera] / seen[camera] < _LITTLE):
         yield (
             f"masks or alpha leave {100 * used[camera] / seen[camera]:.2g} % of the pixels of camera {names[camera]} "
             "to be used: check which color of its masks is left out, or leave the camera out (data.log.cameras)"
+        )
+        blind[camera] = 0
+    for camera in sorted(camera for camera in seen if blind[camera]):
+        yield (
+            f"masks or alpha leave no pixel in {blind[camera]} of {seen[camera]} images of camera {names[camera]}: "
+            "check these masks, nothing is learned from such images"
         )
     for camera in sorted(camera for camera in seen if flat[camera]):
         yield (

@@ -16,7 +16,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 from jaxtyping import Bool, UInt8
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
@@ -357,6 +357,9 @@ def _opened(path: Path, read: Callable[[Image.Image], T]) -> T:
             return read(image)
     except LogError:
         raise
+    except UnidentifiedImageError as error:
+        message = "the image cannot be decoded (no format or type of pixels that Pillow knows)"
+        raise fault(path, message, "write gray or RGB of 8 or 16 bits as PNG or JPEG") from error
     # Pillow reports a broken PNG chunk as SyntaxError.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise fault(path, f"the image cannot be decoded ({error})", _REMEDY) from error

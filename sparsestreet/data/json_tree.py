@@ -89,7 +89,9 @@ class JsonValue:
         """A time in whatever unit, finite: it may be a whole number of nanoseconds, of which a float loses the last."""
         if isinstance(self.value, int) and not isinstance(self.value, bool) and abs(self.value) < _LATEST:
             return self.value
-        return self.number()
+        if not isinstance(self.value, float) or not math.isfinite(self.value):
+            raise self.fault(f"is {_shown(self.value)}, no time", "write a finite number, in the same unit everywhere")
+        return self.value
 
     def whole(self, low: int, high: int) -> int:
         """A whole number between two limits, both included."""

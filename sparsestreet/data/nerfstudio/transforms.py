@@ -21,6 +21,7 @@ from sparsestreet.geometry.lenses import BrownConrady, Fisheye, Lens
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
 _NUMBERS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 _READ = (
     "frames", "file_path", "transform_matrix", "mask_path", "time", "depth_file_path", "ply_file_path", "w", "h", "cx",
@@ -123,6 +124,7 @@ def _lens(top: JsonValue, frame: JsonValue, image: Path) -> tuple[Lens, tuple[in
     fx = _focal(top, frame, "fl_x", "camera_angle_x", size[0], None)
     fy = _focal(top, frame, "fl_y", "camera_angle_y", size[1], fx)
     focal = {"fx": fx, "fy": fy, "cx": number("cx", size[0] / 2), "cy": number("cy", size[1] / 2)}
+    _refuse_other_lenses(top, frame)
     fisheye = _is_fisheye(value("camera_model"), value("is_fisheye"))
     known = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
     for key in _NUMBERS:
@@ -131,6 +133,14 @@ def _lens(top: JsonValue, frame: JsonValue, image: Path) -> tuple[Lens, tuple[in
             raise (value(key) or frame).fault(f"is not 0, but this model has no {key}", remedy)
     numbers = {key: number(key) for key in known}
     return (Fisheye if fisheye else BrownConrady)(**focal, **numbers), size
+
+
+def _refuse_other_lenses(*values: JsonValue) -> None:
+    """Instant-ngp names a lens by the keys that are there."""
+    for value in values:
+        for key in _OTHER_LENSES:
+            if key in value and value[key].value is not False:
+                raise value.fault(f"has {key!r}, a lens that is not read", "undistort the images first")
 
 
 def _is_fisheye(model: JsonValue | None, flag: JsonValue | None) -> bool:

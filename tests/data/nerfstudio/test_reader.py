@@ -256,6 +256,7 @@ DAMAGE = {
     "a lens folds": (frame_with(p1=1.0, p2=1.0), "no inverse"),
     "a fisheye folds": (frame_with(camera_model="OPENCV_FISHEYE", k1=-3.0), "folds back"),
     "k4 of a pinhole": (frame_with(k4=0.1), "this model has no k4"),
+    "a time not finite": (frame_with(time=math.nan), r"frames\[3\]\.time is nan, no time"),
     "some times": (frame_with(time=0.5), "has a time in 1 of 8 frames"),
     "no mask": (frame_with(mask_path="none.png"), "none.png: the file is missing"),
     "no points": (top_with(ply_file_path="none.ply"), "none.ply: the file is missing"),
@@ -353,6 +354,7 @@ def test_instant_ngps_flag_is_a_fisheye_and_what_nothing_reads_is_said(written):
         ({"is_fisheye": True, "camera_model": "OPENCV"}, "is_fisheye is True, but camera_model is OPENCV"),
         ({"is_fisheye": True, "p1": 0.1}, "p1 is not 0, but this model has no p1"),
         ({"k6": 0.1}, "k6 is not 0, but this model has no k6"),
+        ({"ftheta_p0": 1.0}, "has 'ftheta_p0', a lens that is not read"),
     ],
 )
 def test_numbers_that_contradict_the_lens_are_refused(values, said, written):
