@@ -8,6 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from sparsestreet.data.doubts import doubts
+from sparsestreet.data.ego import check_used
 from sparsestreet.data.hood import find_hoods, with_hoods
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
@@ -24,6 +25,11 @@ def report_check(reader: LogReader, console: Console | None = None) -> int:
         console.print(f"[bold red]{len(problems)} to repair[/] in {escape(str(reader.folder))}")
         return 1
     log = reader.read()
+    try:
+        check_used(log.frames, log.name)
+    except ValueError as error:
+        console.print(f"[bold red]nothing to train on[/]: {escape(str(error))}")
+        return 1
     console.print(_summary(log))
     console.print(_camera_table(log))
     if log.tracks:

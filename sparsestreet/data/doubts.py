@@ -1,11 +1,12 @@
 """What is probably wrong with a log that can be read: said once, before anything is trained."""
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 
 import torch
 from torch import Tensor
 
+from sparsestreet.data.ego import used_share
 from sparsestreet.data.followed import FEWEST, followed
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog
@@ -13,6 +14,8 @@ from sparsestreet.types import Track, View
 
 MOST_FRAMES = 36
 """Images that are looked at."""
+_LITTLE = 0.05
+"""Of all pixels: fewer that losses see are more likely a mask that is turned round."""
 _FLAT = 3.0
 """Gray levels, standard deviation over an image, below which it shows nothing."""
 _UNLIKE = 1.0
@@ -41,13 +44,28 @@ def doubts(log: DrivingLog, frames: Frames | None = None) -> tuple[str, ...]:
 
 
 def _covered(frames: Frames, names: Sequence[str]) -> Iterator[str]:
-    seen, flat = Counter[int](), Counter[int]()
+    seen, flat, blind, used = Counter[int](), Counter[int](), Counter[int](), defaultdict[int, float](float)
     for place in spread(len(frames), MOST_FRAMES):
         frame = frames[place]
         camera = frame.indices[1]
         gray = frame.image.float().mean(-1)
         seen[camera] += 1
-        flat[camera] += float((gray if frame.ego is None else gray[~frame.ego]).std()) < _FLAT
+        share = used_share(frame)
+        used[camera] += share
+        blind[camera] += not share
+        gray = gray if frame.ego is None else gray[~frame.ego]
+        flat[camera] += share > 0 and float(gray.std(correction=0)) < _FLAT
+    for camera in (camera for camera in sorted(seen) if used[camera] / seen[camera] < _LITTLE):
+        yield (
+            f"masks or alpha leave {100 * used[camera] / seen[camera]:.2g} % of the pixels of camera {names[camera]} "
+            "to be used: check which color of its masks is left out, or leave the camera out (data.log.cameras)"
+        )
+        blind[camera] = 0
+    for camera in sorted(camera for camera in seen if blind[camera]):
+        yield (
+            f"masks or alpha leave no pixel in {blind[camera]} of {seen[camera]} images of camera {names[camera]}: "
+            "check these masks, nothing is learned from such images"
+        )
     for camera in sorted(camera for camera in seen if flat[camera]):
         yield (
             f"camera {names[camera]} shows a single gray level in {flat[camera]} of {seen[camera]} images, as if it "

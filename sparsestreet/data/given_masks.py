@@ -2,13 +2,14 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from jaxtyping import Bool
 from torch import Tensor
 
-from sparsestreet.data.images import image_size, read_mask
-from sparsestreet.data.problems import Problem, fault, missing_files
+from sparsestreet.data.images import check_mask, image_size, read_mask
+from sparsestreet.data.problems import Problem, attempt, fault, missing_files
 from sparsestreet.data.undistortion import Undistortion
 
 _KINDS = ("sky", "human", "vehicle", "ego")
@@ -61,3 +62,10 @@ class GivenMasks:
             message = f"it holds none of the folders {', '.join(_KINDS)}"
             return [Problem(self.root, message, "name the folder that holds them (data.log.masks), or null")]
         return missing_files(path for camera, stem in images for path in self.paths(camera, stem).values())
+
+    def check_pixels(self, images: Iterable[tuple[str, str]], size: tuple[int, int]) -> list[Problem]:
+        """What is wrong with those that are there, all of which are decoded; ``size``: (width, height) as recorded."""
+        problems: list[Problem] = []
+        for path in filter(Path.is_file, (path for each in images for path in self.paths(*each).values())):
+            attempt(problems, partial(check_mask, path, size, decode=True))
+        return problems

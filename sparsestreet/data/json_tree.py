@@ -2,9 +2,9 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from typing import Any
 
 import torch
@@ -16,6 +16,7 @@ from sparsestreet.data.problems import LogError, fault
 _LARGEST_FILE = 128_000_000
 """Bytes; Python's values of such a file take ten times as many."""
 _LARGEST_NUMBER = 1e15
+_LATEST = 2**63
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,11 @@ class JsonValue:
             raise self.fault(f"has {unknown[0][:40]!r}, which nothing reads", f"write one of {', '.join(keys)}")
         return self
 
+    def unread(self, known: Collection[str]) -> list[str]:
+        """Names of an object's entries that are none of ``known``; null counts as absent."""
+        self._must_be(dict, "an object in braces")
+        return [key for key in self.value if key in self and key not in known]
+
     def entries(self) -> Iterator[tuple[str, "JsonValue"]]:
         """Names and values of an object, in its order."""
         self._must_be(dict, "an object in braces")
@@ -79,6 +85,14 @@ class JsonValue:
             raise self.fault(message, "write the value of the calibration or of the pose")
         return float(self.value)
 
+    def moment(self) -> float | int:
+        """A time in whatever unit, finite: it may be a whole number of nanoseconds, of which a float loses the last."""
+        if isinstance(self.value, int) and not isinstance(self.value, bool) and abs(self.value) < _LATEST:
+            return self.value
+        if not isinstance(self.value, float) or not math.isfinite(self.value):
+            raise self.fault(f"is {_shown(self.value)}, no time", "write a finite number, in the same unit everywhere")
+        return self.value
+
     def whole(self, low: int, high: int) -> int:
         """A whole number between two limits, both included."""
         value = self.value
@@ -102,10 +116,14 @@ class JsonValue:
         return torch.tensor(values, dtype=torch.float64)
 
     def path(self) -> Path:
-        """A file's name, relative to the JSON's folder and inside of it."""
+        """A file's name, relative to the JSON's folder and inside of it. Backslashes of Windows separate folders,
+        unless a file has them in its name."""
         name = self.text()
         inside = Path(name)
-        if not name or "\0" in name or inside.is_absolute() or ".." in inside.parts:
+        if "\\" in name and "\0" not in name and not (self.file.parent / inside).is_file():
+            inside = Path(name.replace("\\", "/"))
+        outside = inside.is_absolute() or PureWindowsPath(name).drive or ".." in inside.parts
+        if not name or "\0" in name or outside:
             message = f"is {_shown(name)}, which is no file below the folder of {self.file.name}"
             raise self.fault(message, "name it relative to that folder, without '..'")
         return self.file.parent / inside
@@ -125,14 +143,15 @@ def read_json(path: Path) -> JsonValue:
         message = f"the file has {path.stat().st_size:,} bytes, more than the {_LARGEST_FILE:,} that are read"
         raise fault(path, message, "write numbers with fewer digits, or split the recording")
     try:
-        return JsonValue(path, "", json.loads(path.read_bytes(), object_pairs_hook=_unique))
+        return JsonValue(path, "", json.loads(path.read_bytes(), object_pairs_hook=unique))
     except RecursionError as error:
         raise fault(path, "the file is no JSON that can be read (brackets in brackets without end)", remedy) from error
     except (OSError, ValueError) as error:
         raise fault(path, f"the file is no JSON ({error})", remedy) from error
 
 
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object of JSON, for ``json.loads``; raises ValueError for a name that stands twice."""
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]

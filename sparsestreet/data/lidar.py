@@ -1,28 +1,52 @@
 """Lidar points and images: the colors that points take from pixels, and the depth they give to them."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
-from sparsestreet.data.problems import fault
+from sparsestreet.data.lazy import spread
+from sparsestreet.data.problems import attempt, fault
 from sparsestreet.geometry.cameras import project
 from sparsestreet.metrics.definitions import LIDAR_REACH
 from sparsestreet.types import Camera, Frame
 
+_NEAREST = 1e-3
+"""Meters."""
 _FARTHEST = 1000.0
 """Meters: no street lidar reaches this far, so a point beyond it is not a point."""
 
 
 def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "drop these returns") -> None:
-    """Raises LogError, naming the file, unless all points, in the frame of their sensor, are where lidar can see."""
+    """Raises LogError, naming the file, unless all points, in the frame of their sensor, are where lidar can see.
+
+    Those at the sensor itself pass: many drivers write zeros where nothing came back (``returned``).
+    """
     # A NaN compares false, so it counts as broken too.
     broken = int((~(points.abs() <= _FARTHEST)).any(-1).sum())
     if broken:
         message = f"{broken} of {points.shape[0]} points are NaN, infinite or more than {_FARTHEST:g} m away"
         raise fault(path, message, remedy)
+
+
+def returned(points: Float64[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
+    """Return which points, in the frame of their sensor, came back from something: all but those nearer than 1 mm."""
+    return ~(points.norm(dim=-1) < _NEAREST)  # NaN is no zero: check_points names it
+
+
+def empty_notes(read: Callable[[Path], Float64[Tensor, "n 3"]], paths: Sequence[Path]) -> list[str]:
+    """Say how many points of some sweeps are no returns; ``read`` gives those of a file in the frame of their sensor.
+    Three sweeps are looked at; broken ones are passed over."""
+    counts = []
+    for place in spread(len(paths), 3):
+        points = attempt([], partial(read, paths[place]))
+        if points is not None and (empty := int((~returned(points)).sum())):
+            counts.append(f"{empty} of {len(points)} in {paths[place].name}")
+    said = "points at the sensor itself are no returns and are dropped, such as"
+    return [f"{said} {', '.join(counts)}"] if counts else []
 
 
 def color_points(

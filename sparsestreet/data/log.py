@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sparsestreet.data.hood import Hood
 from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.tracks import repeated
 from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.types import Frame, SparsePoints, Track, View
 
@@ -80,6 +81,11 @@ class DrivingLog:
 
     vehicle: VehiclePath | None = None
     """None: the log tells where its cameras were, but not the car that carried them."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError where two objects have one name: layouts and nodes know them by it."""
+        if twice := repeated([track.name for track in self.tracks]):
+            raise ValueError(f"objects of a log have different names, {twice!r} stands twice: rename one of them")
 
     def holding_out(self, frames: frozenset[int]) -> "DrivingLog":
         """The log, where depth and colors of other frames depend on no box of these.

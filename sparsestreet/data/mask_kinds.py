@@ -6,10 +6,12 @@ from functools import lru_cache
 
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.types import Frame
 
 KINDS = ("sky", "human", "vehicle")
+_LOOKED_AT = 12
+"""Images of a camera whose first one has no mask of the recording car."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class MaskKinds:
 
 @lru_cache(maxsize=1)
 def find_masks(frames: Frames) -> MaskKinds:
-    """Decodes images until no more kind can be in all of them: one each of a log without masks, else all."""
+    """Decodes images until no more kind can be in all of them: a few of a log without masks, else all."""
     lacking: dict[str, tuple[int, int]] = {}
     for frame in frames:
         for kind in KINDS:
@@ -39,14 +41,17 @@ def find_masks(frames: Frames) -> MaskKinds:
     ego, changing = {}, []
     for camera in sorted({view.indices[1] for view in frames.views}):
         own = frames.where(lambda view, camera=camera: view.camera_index == camera)
-        if (first := own[0]).ego is not None:
-            if all(_same_ego(first, frame) for frame in own):
-                ego[camera] = first
-            else:
-                changing.append(camera)
+        first = own[0]
+        others = own if first.ego is not None else own.at(spread(len(own), _LOOKED_AT))
+        if not all(_same_ego(first, frame) for frame in others):
+            changing.append(camera)
+        elif first.ego is not None:
+            ego[camera] = first
     everywhere = tuple(kind for kind in KINDS if kind not in lacking)
     return MaskKinds(everywhere, lacking, ego, tuple(changing))
 
 
 def _same_ego(frame: Frame, other: Frame) -> bool:
-    return frame.ego is not None and other.ego is not None and torch.equal(frame.ego, other.ego)
+    if frame.ego is None or other.ego is None:
+        return frame.ego is other.ego
+    return torch.equal(frame.ego, other.ego)

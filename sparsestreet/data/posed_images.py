@@ -20,7 +20,7 @@ from sparsestreet.data.extent import check_extent
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images, check_image_sizes, read_image, read_mask
 from sparsestreet.data.poses import check_rigid
-from sparsestreet.data.problems import Problem, attempt, fault, missing_files
+from sparsestreet.data.problems import Problem, attempt, fault, missing_files, missing_notes
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.window import chosen_cameras, frame_window
@@ -43,7 +43,7 @@ class PosedImage:
     """OpenCV's axes, the data set's own world and unit."""
     valid: Path | None = None
     """A mask that is black where the image is not to be used."""
-    time: float | None = None
+    time: float | int | None = None
     """When it was taken, in whatever unit."""
 
 
@@ -92,6 +92,16 @@ def sort_images(
     return PosedImages({name: kinds[name] for name in chosen}, [ordered[place] for place in window])
 
 
+def there(images: Sequence[PosedImage], table: Path) -> tuple[list[PosedImage], list[str]]:
+    """Return the images whose files are there, and what is said of the others, which ``table`` lists too. Raises
+    LogError where all are missing."""
+    found = [image for image in images if image.path.is_file()]
+    if not found:
+        message = f"none of the {len(images)} images that it lists is there, the first is {images[0].path}"
+        raise fault(table, message, "write the images, or name the folder that holds them")
+    return found, missing_notes(len(images) - len(found), len(images))
+
+
 def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, decode: bool) -> list[Problem]:
     """What is wrong with lenses, poses and files of images and masks; all pixels are looked at if ``decode``.
 
@@ -113,8 +123,13 @@ def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, 
             attempt(problems, partial(check_rigid, image.world_from_camera, table, f"the pose of {image.name}"))
             placed.append((table, image.world_from_camera[:3, 3]))
     if masks is not None:
-        stems = ((name, image.path.stem) for instant in images.instants for name, image in instant.items())
-        problems += GivenMasks(Path(masks)).check(stems)
+        given = GivenMasks(Path(masks))
+        problems += given.check(
+            (name, image.path.stem) for instant in images.instants for name, image in instant.items()
+        )
+        for name, (_, size) in images.cameras.items() if decode else ():
+            stems = [(name, instant[name].path.stem) for instant in images.instants if name in instant]
+            problems += given.check_pixels(stems, size)
     return problems or check_extent(placed)
 
 
@@ -162,13 +177,13 @@ def recording_of(
     )
 
 
-def natural(key: object) -> list[tuple[int, float, str]]:
+def natural(key: object) -> list[tuple[int, float | int, str]]:
     """Orders names as people count: 2 before 10. A time is a number.
 
     >>> sorted(["b10", "b9", "a"], key=natural)
     ['a', 'b9', 'b10']
     """
-    if isinstance(key, float):
+    if isinstance(key, (float, int)):
         return [(0, key, "")]
     parts = re.split(r"(\d+)", str(key))
     return [(0, float(part), part) if place % 2 else (1, 0.0, part) for place, part in enumerate(parts)]

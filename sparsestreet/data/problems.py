@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar, get_args
 
 _SHOWN = 5
 """Problems an error message spells out; a check returns all of them."""
@@ -58,8 +58,8 @@ def missing_files(paths: Iterable[Path]) -> list[Problem]:
         if not path.is_file():
             absent.setdefault(path.parent, []).append(path)
     remedy = (
-        "write the missing files, or read only complete frames (data.log.first_frame, .last_frame) and cameras "
-        "(data.log.cameras)"
+        "write the missing files, leave out what is scattered (data.log.missing=skip, of readers that have it), or "
+        "read only complete frames (data.log.first_frame, .last_frame) and cameras (data.log.cameras)"
     )
     problems = []
     for files in absent.values():
@@ -67,3 +67,18 @@ def missing_files(paths: Iterable[Path]) -> list[Problem]:
         message = "the file is missing" if len(files) == 1 else f"{len(files)} files of the folder are missing: {names}"
         problems.append(Problem(files[0], message, remedy))
     return problems
+
+
+Missing = Literal["error", "skip"]
+"""What becomes of listed images without a file: an error, or they are left out with a note."""
+
+
+def check_missing(missing: str) -> None:
+    """Raise ValueError for what is no choice of ``Missing``."""
+    if missing not in get_args(Missing):
+        raise ValueError(f"missing must be one of {', '.join(get_args(Missing))}, got {missing!r}")
+
+
+def missing_notes(absent: int, total: int, what: str = "listed images") -> list[str]:
+    """Say how many of ``total`` were left out; nothing where none was."""
+    return [f"{absent} of {total} {what} lack files and are left out (data.log.missing=skip)"] if absent else []

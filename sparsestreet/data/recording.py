@@ -5,7 +5,7 @@ depth images and colors of returns are the same for all data sets, and are done 
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import chain, pairwise
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
-from sparsestreet.data.images import check_camera_images
+from sparsestreet.data.images import check_camera_images, image_notes, joined, read_transparent
 from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.data.motion import PosePath
@@ -27,7 +27,7 @@ from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.scene_folder import SceneFolder
-from sparsestreet.data.tracks import checked_track, timed_tracks, track_in_window
+from sparsestreet.data.tracks import checked_track, repeated, timed_tracks, track_in_window
 from sparsestreet.types import Frame, Shutter, SparsePoints, Track, View
 
 MASK_KINDS = ("sky", "human", "vehicle", "ego")
@@ -53,6 +53,12 @@ class Shot:
     """Its motion while it is read out, where the data set declares a rolling shutter."""
     exposure: float | None = None
     """Seconds that a pixel is exposed, where declared."""
+
+    @property
+    def path(self) -> Path | None:
+        """The file of its pixels; None: they stand in the file of many."""
+        found = getattr(self.key, "path", self.key)
+        return Path(found) if isinstance(found, (str, Path)) else None
 
 
 @dataclass(frozen=True)
@@ -176,7 +182,15 @@ class RecordedReader(LogReader):
         return self.check_contents()
 
     def read(self) -> DrivingLog:
-        return log_of(self.recording(), cache_bytes=cache_bytes(self.cache_mb), check=self.check_contents)
+        recording = self.recording()
+        recording = replace(recording, notes=(*recording.notes, *self._pixel_notes(recording)))
+        return log_of(recording, cache_bytes=cache_bytes(self.cache_mb), check=self.check_contents)
+
+    def _pixel_notes(self, recording: Recording) -> Iterator[str]:
+        """Of images, by their headers."""
+        for camera in recording.rig:
+            own = [shot for shot in recording.shots if shot.camera == camera.index]
+            yield from image_notes(camera.name, [path for shot in own if (path := shot.path) is not None])
 
 
 def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[], list[Problem]]) -> DrivingLog:
@@ -193,6 +207,9 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
     origin = recording.shots[0].world_from_camera[:3, 3]
     recording = replace(recording, boxes=_filled(recording))
     boxes = [_checked(each) for each in recording.boxes or ()]
+    if twice := repeated([each.name for each in recording.boxes or ()]):
+        file = next(each.path for each in recording.boxes or () if each.name == twice)
+        raise fault(file, f"two objects are named {twice!r}", "give each object one name and one list of boxes")
     clock = _clock(recording, num_frames)
     views = [_view(shot, recording.rig, origin, clock) for shot in recording.shots]
     found = [track_in_window(track, range(num_frames), origin) for track in boxes]
@@ -307,7 +324,9 @@ def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], cl
 def _frame(recording: Recording, shots: Mapping[tuple[int, int], Shot], view: View) -> Frame:
     shot = shots[view.indices]
     masks = dict(recording.read_masks(shot))
-    ego = recording.rig[shot.camera].not_of_the_street(masks.pop("ego", None))
+    camera = recording.rig[shot.camera]
+    hidden = None if shot.path is None else read_transparent(shot.path, camera.size, camera.undistortion)
+    ego = camera.not_of_the_street(joined(masks.pop("ego", None), hidden))
     others = {kind: masks.get(kind) for kind in MASK_KINDS if kind != "ego"}
     return Frame.of(view, image=recording.read_image(shot), ego=ego, **others)
 

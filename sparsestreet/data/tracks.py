@@ -1,5 +1,6 @@
 """Tracks of annotated objects: checked, cut to the frames that are read, and timed by the log's clock."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,11 @@ from sparsestreet.data.clock import LogClock
 from sparsestreet.data.poses import are_rigid, check_rigid, recentered
 from sparsestreet.data.problems import fault
 from sparsestreet.types import Track, View
+
+
+def repeated(names: Sequence[str]) -> str | None:
+    """Return the first name that stands twice; None where there is none."""
+    return next((name for name, count in Counter(names).items() if count > 1), None)
 
 
 def checked_track(
@@ -57,19 +63,21 @@ def checked_track(
     return Track(name, class_name, torch.from_numpy(frames.astype(np.int64)), torch.from_numpy(poses), size)
 
 
-def track_in_window(track: Track, frames: range, origin: Float64[Tensor, "3"]) -> Track | None:
-    """The track inside the window, frames counted from its start, in the re-centered world; None where it is absent.
+def track_in_window(track: Track, frames: Sequence[int], origin: Float64[Tensor, "3"]) -> Track | None:
+    """The track in these frames, which increase, counted by their places, in the re-centered world; None where it is
+    absent.
 
     The size stays the mean over all of the log: an object does not change with the window.
     """
-    inside = (track.frames >= frames.start) & (track.frames < frames.stop)
+    wanted = torch.tensor(frames)
+    inside = torch.isin(track.frames, wanted)
     if not inside.any():
         return None
     poses = recentered(track.world_from_object[inside], origin)
     body = None
     if track.body is not None:
         body = replace(track.body, rotations=track.body.rotations[inside], valid=track.body.valid[inside])
-    return replace(track, frames=track.frames[inside] - frames.start, world_from_object=poses, body=body)
+    return replace(track, frames=torch.searchsorted(wanted, track.frames[inside]), world_from_object=poses, body=body)
 
 
 def timed_tracks(

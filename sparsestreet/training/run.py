@@ -17,6 +17,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.doubts import doubts
+from sparsestreet.data.ego import check_used
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene, help_to_evaluate
 from sparsestreet.phases import StageRecorder, stage
@@ -168,13 +169,15 @@ def train(
 def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
     """The scene as it starts, from what training may see and through the effects of ``recipe.plan``, ready for ``fit``.
 
-    Raises ValueError for parts of the recipe that do not fit together, or that have nothing to start from.
+    Raises ValueError for parts of the recipe that do not fit together, that have nothing to start from, and for masks
+    that leave no pixel to be used.
     """
     recipe.check()
     seed_everything(recipe.seed, verbose=False)
     for note in data.driving_log.notes:
         log.info(note)
     with stage("initialize"):
+        check_used(data.split.train, data.driving_log.name)
         for doubt in doubts(data.driving_log, data.split.train):
             log.warning(doubt)
         return recipe.build(data, plan)

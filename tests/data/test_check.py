@@ -1,13 +1,20 @@
 """What the command prints."""
 
 import io
+from dataclasses import replace
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 from rich.console import Console
 
 from sparsestreet.data.check import report_check
 from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.ego import check_used
+from sparsestreet.data.lazy import Frames
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
+from tests.data.streets import make_log
 
 
 @pytest.fixture
@@ -47,3 +54,25 @@ def test_every_problem_is_printed_with_its_remedy(tmp_path, console):
 def test_a_folder_that_is_not_there_is_a_problem(tmp_path, console):
     assert report_check(DriveStudioReader(tmp_path / "nowhere"), console) == 1
     assert "nothing is there" in console.file.getvalue()
+
+
+@pytest.mark.parametrize("share", [1.0, 0.99])
+def test_masks_that_leave_nothing_are_named(share, tmp_path, console, recwarn):
+    make_nuscenes(tmp_path)
+    (tmp_path / "ego_masks").mkdir()
+    mask = np.full((24, 40), 255, np.uint8)
+    mask.reshape(-1)[round(share * mask.size) :] = 0
+    for camera in range(2):
+        Image.fromarray(mask).save(tmp_path / f"ego_masks/{camera}.png")
+    assert report_check(DriveStudioReader(tmp_path), console) == (share == 1)
+    said = {1.0: "6 of 6 images of", 0.99: "masks or alpha leave 1 % of the pixels of camera 0 to be used"}
+    assert said[share] in console.file.getvalue()
+    assert not recwarn
+
+
+def test_a_street_without_a_used_pixel_is_not_trained(tmp_path):
+    log = make_log(4)
+    dark = Frames.of([replace(frame, ego=torch.ones(frame.image.shape[:2], dtype=torch.bool)) for frame in log.frames])
+    with pytest.raises(ValueError, match=r"8 of 8 images of .* have no pixel that is used, because masks or alpha"):
+        check_used(dark, log.name)
+    check_used(Frames.of([*dark, *log.frames]), log.name)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import split
-from sparsestreet.types import SparsePoints, Sweep
+from sparsestreet.types import SparsePoints, Sweep, Track
 from tests.data.streets import make_log
 
 
@@ -180,3 +180,10 @@ def test_where_no_camera_sees_a_point_all_of_them_count():
     points = torch.tensor([[0.0, 0, 0], [100.0, 0, 0]]).repeat(50, 1)
     log = make_log(num_frames=1, num_cameras=1, sweeps=(sweep(points, torch.zeros(100, dtype=torch.bool)),))
     assert log.radius == pytest.approx(1.1 * 50)
+
+
+def test_two_objects_of_one_name_are_no_log():
+    log = make_log(3)
+    track = Track("a", "car", torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None], torch.ones(3))
+    with pytest.raises(ValueError, match="'a' stands twice: rename one of them"):
+        replace(log, tracks=(track, replace(track, name="b"), track))

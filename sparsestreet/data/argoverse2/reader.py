@@ -10,12 +10,20 @@ from jaxtyping import Bool, UInt8
 from torch import Tensor
 
 from sparsestreet.data.argoverse2.layout import EGO_ROWS, Selection, find_log, select
-from sparsestreet.data.argoverse2.tables import MountedCamera, read_boxes, read_cameras, read_path, read_sweep
+from sparsestreet.data.argoverse2.tables import (
+    MountedCamera,
+    read_boxes,
+    read_cameras,
+    read_path,
+    read_points,
+    read_sweep,
+)
 from sparsestreet.data.ego import bottom_rows
 from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import image_size, read_image
+from sparsestreet.data.lidar import empty_notes
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.problems import LogError, fault
@@ -64,7 +72,10 @@ class Argoverse2Reader(RecordedReader):
             sweeps=_sweeps(chosen, path) if self.lidar else None,
             boxes=boxes,
             vehicle=_driven(chosen, path),
-            notes=_notes(chosen, duplicates, homeless, len(shots)),
+            notes=(
+                *_notes(chosen, duplicates, homeless, len(shots)),
+                *empty_notes(read_points, [chosen.sweeps[stamp] for stamp in chosen.instants] if self.lidar else []),
+            ),
         )
 
     def files(self) -> LogFiles:

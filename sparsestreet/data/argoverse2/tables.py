@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sparsestreet.data.argoverse2.feather import read_columns
 from sparsestreet.data.argoverse2.layout import Layout
-from sparsestreet.data.lidar import check_points
+from sparsestreet.data.lidar import check_points, returned
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.poses import rigid_poses
 from sparsestreet.data.problems import fault
@@ -140,10 +140,16 @@ def read_sweep(path: Path, city_from_ego: Float64[Tensor, "4 4"]) -> Float64[Ten
     They are stored in float16, in the vehicle's frame at the stamp of the sweep, both lidars together and the vehicle's
     motion taken out.
     """
-    table = read_columns(path, dict.fromkeys(("x", "y", "z"), float))
-    points = _rows(table, ("x", "y", "z"))
-    check_points(points, path)
+    points = read_points(path)
+    points = points[returned(points)]
     return points @ city_from_ego[:3, :3].T + city_from_ego[:3, 3]
+
+
+def read_points(path: Path) -> Float64[Tensor, "n 3"]:
+    """Points in the vehicle's frame, as ``read_sweep`` finds them."""
+    points = _rows(read_columns(path, dict.fromkeys(("x", "y", "z"), float)), ("x", "y", "z"))
+    check_points(points, path)
+    return points
 
 
 def _rows(table: Mapping[str, np.ndarray], columns: Sequence[str]) -> Float64[Tensor, "n _"]:

@@ -89,7 +89,8 @@ def _camera(row: CameraRow, path: Path) -> tuple[Lens, tuple[int, int]]:
 def _image(
     row: ImageRow, lenses: Mapping[int, tuple[Lens, tuple[int, int]]], model: SparseModel, folder: Path
 ) -> PosedImage:
-    name = PurePosixPath(row.name)
+    written = (folder / row.name).is_file() or "\\" not in row.name
+    name = PurePosixPath(row.name if written else row.name.replace("\\", "/"))
     if not row.name or name.is_absolute() or ".." in name.parts:
         message = f"image {row.number} is named {row.name[:60]!r}, which is no file below a folder of images"
         raise fault(model.images, message, "name images relative to that folder")

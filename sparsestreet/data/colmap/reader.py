@@ -7,8 +7,8 @@ from pathlib import Path
 from sparsestreet.data.colmap.model import SparseModel, find_model, read_images, read_points
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.marks import Marks
-from sparsestreet.data.posed_images import PosedImages, check_images, recording_of, sort_images
-from sparsestreet.data.problems import LogError, Problem, attempt
+from sparsestreet.data.posed_images import PosedImages, check_images, recording_of, sort_images, there
+from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing
 from sparsestreet.data.recording import RecordedReader, Recording
 
 _HELD_OUT = "points of the model were made of all images, of those that are held out too"
@@ -37,9 +37,14 @@ class ColmapReader(RecordedReader):
     """Meters to a unit of the model."""
     pinhole_fov: float | None = None
     """Degrees that the pinhole of a fisheye sees from left to right; None: its resolution is that of the center."""
+    missing: Missing = "error"
+    """skip: images that are listed and have no file are left out with a note, before frames are counted."""
+
+    def __post_init__(self) -> None:
+        check_missing(self.missing)
 
     def recording(self) -> Recording:
-        model, images = self._read()
+        model, images, absent = self._read()
         if problems := check_images(images, model.images, masks=self.masks, decode=False):
             raise LogError(problems)
         return recording_of(
@@ -48,24 +53,25 @@ class ColmapReader(RecordedReader):
             scale=self.scale,
             pinhole_fov=self.pinhole_fov,
             sparse_points=None if model.points is None else partial(read_points, model.points),
-            notes=["the model has no points"] if model.points is None else [_HELD_OUT],
+            notes=[*absent, "the model has no points" if model.points is None else _HELD_OUT],
         )
 
     def check_contents(self) -> list[Problem]:
-        model, images = self._read()
+        model, images, _ = self._read()
         problems = check_images(images, model.images, masks=self.masks, decode=True)
         if model.points is not None:
             attempt(problems, partial(read_points, model.points))
         return problems
 
     def files(self) -> LogFiles:
-        model, images = self._read()
+        model, images, _ = self._read()
         return LogFiles([model.cameras, model.images], [*(image.path for image in images.images), *model.files[2:]])
 
-    def _read(self) -> tuple[SparseModel, PosedImages]:
+    def _read(self) -> tuple[SparseModel, PosedImages, list[str]]:
         model = find_model(self.folder, self.model)
         found = read_images(model, self.folder / Path(self.images))
+        found, absent = there(found, model.images) if self.missing == "skip" else (found, [])
         images = sort_images(
             found, model.images, cameras=self.cameras, first_frame=self.first_frame, last_frame=self.last_frame
         )
-        return model, images
+        return model, images, absent

@@ -1,5 +1,6 @@
 """Sparse models in text: an entry a line, numbers separated by spaces, comments behind a #."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from sparsestreet.data.colmap.rows import CameraRow, ImageRow
 from sparsestreet.data.problems import LogError, fault
 
 _REMEDY = "export the model again"
+_LONGEST_NAME = 60
+"""Words."""
 _LONGEST_LINE = 32_000_000
 """Bytes: an image's line holds all of its observations."""
 _MODELS = {model.name: model for model in MODELS}
@@ -33,10 +36,16 @@ def camera_rows(path: Path) -> Iterator[CameraRow]:
 
 
 def image_rows(path: Path) -> Iterator[ImageRow]:
-    """Two lines an image; the second, of observations, may be empty and is passed over."""
-    lines = _lines(path)
-    for number, line in lines:
-        if not line.strip() or line.startswith("#"):
+    """Two lines an image; the second, of observations, may be empty and is passed over. Files that are written by hand
+    leave these lines out, so what cannot be one is the next image."""
+    number, waiting, observed = 0, False, False
+    for number, line in _lines(path):
+        if line.startswith("#"):
+            continue
+        if waiting and (not line.strip() or _observes(line)):
+            waiting, observed = False, True
+            continue
+        if not line.strip():
             continue
         words = line.split(maxsplit=9)
         try:
@@ -46,8 +55,20 @@ def image_rows(path: Path) -> Iterator[ImageRow]:
             yield ImageRow(int(words[0]), words[9].strip(), int(words[8]), pose)
         except ValueError as error:
             raise _broken(path, number, f"it is no image ({error})") from error
-        if next(lines, None) is None:
-            raise _broken(path, number, "no line of observations follows it, which may be empty")
+        waiting = True
+    if waiting and observed:
+        raise _broken(path, number, "no line of observations follows it, which may be empty")
+
+
+def _observes(line: str) -> bool:
+    """Whether these are triples of numbers; of a long line the last word tells, because no name is as long."""
+    words = line.split(maxsplit=_LONGEST_NAME)
+    if len(words) > _LONGEST_NAME:
+        words = [line.rsplit(maxsplit=1)[-1]] * 3
+    try:
+        return len(words) % 3 == 0 and all(float(word) < math.inf for word in words)
+    except ValueError:
+        return False
 
 
 def points(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout
 from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.problems import LogError, missing_files
 
 
 def required_files(layout: Layout) -> list[Path]:
@@ -15,6 +16,19 @@ def required_files(layout: Layout) -> list[Path]:
         files += [layout.sweep(frame) for frame in layout.frames]
     files += [layout.bodies] if layout.has_bodies else []
     return files + ([layout.instances] if layout.has_instances else [])
+
+
+def complete(layout: Layout) -> Layout:
+    """Return the layout without frames that lack a file. Raises LogError where every frame does."""
+    common = set(required_files(replace(layout, frames=())))
+    frames = [
+        frame
+        for frame in layout.frames
+        if all(path.is_file() for path in required_files(replace(layout, frames=(frame,))) if path not in common)
+    ]
+    if not frames:
+        raise LogError(missing_files(required_files(layout)))
+    return replace(layout, frames=frames, absent=len(layout.frames) - len(frames))
 
 
 def pose_files(layout: Layout) -> list[Path]:

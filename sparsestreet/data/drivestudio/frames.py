@@ -1,6 +1,6 @@
 """Views from poses and calibrations, and frames from the files of images and masks."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from jaxtyping import Float64
 from torch import Tensor
@@ -8,7 +8,14 @@ from torch import Tensor
 from sparsestreet.data.clock import LogClock
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, Layout
 from sparsestreet.data.drivestudio.poses import read_image_stamps, read_intrinsics, world_from_camera
-from sparsestreet.data.images import image_size, read_image, read_mask
+from sparsestreet.data.images import (
+    image_notes,
+    image_size,
+    joined,
+    read_image,
+    read_mask,
+    read_transparent,
+)
 from sparsestreet.data.poses import recentered
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.types import Frame, View
@@ -56,12 +63,17 @@ def read_frame(layout: Layout, rig: Sequence[RigCamera[int]], view: View) -> Fra
         kind: None if path is None else read_mask(path, camera.size, sky=kind == "sky", undistortion=lens)
         for kind, path in paths.items()
     }
-    ego = layout.ego_mask(camera.name)
+    path, mask = layout.image(number, camera.name), layout.ego_mask(camera.name)
+    ego = None if mask is None else read_mask(mask, camera.size, sky=False, undistortion=lens)
     return Frame.of(
         view,
-        image=read_image(layout.image(number, camera.name), camera.size, lens),
-        ego=camera.not_of_the_street(
-            None if ego is None else read_mask(ego, camera.size, sky=False, undistortion=lens)
-        ),
+        image=read_image(path, camera.size, lens),
+        ego=camera.not_of_the_street(joined(ego, read_transparent(path, camera.size, lens))),
         **masks,
     )
+
+
+def pixel_notes(layout: Layout) -> Iterator[str]:
+    """What is done with unusual pixels of images, by their headers."""
+    for camera in layout.cameras:
+        yield from image_notes(camera, (layout.image(frame, camera) for frame in layout.frames))

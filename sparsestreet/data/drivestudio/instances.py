@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from sparsestreet.data.drivestudio.layout import Layout
+from sparsestreet.data.json_tree import unique
 from sparsestreet.data.problems import LogError, Problem, fault
 from sparsestreet.data.tracks import checked_track
 from sparsestreet.types import Track
@@ -60,7 +61,7 @@ def _read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise fault(path, "the file is missing", "write it, or remove the folder to read the log without boxes")
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(), object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         raise fault(path, f"the file is no JSON ({error})", "write it again from the annotations") from error
     if not isinstance(content, dict):

@@ -26,8 +26,8 @@ class Layout:
 
     root: Path
     flavor: Flavor
-    frames: range
-    """Frames of the window, in the folder's own numbers."""
+    frames: Sequence[int]
+    """Frames of the window that are read, in the folder's own numbers."""
     cameras: tuple[int, ...]
     front: int
     """Lowest camera number in the folder: the re-centered world starts there, whichever cameras are read."""
@@ -36,6 +36,8 @@ class Layout:
     """Whether there are sweeps, and they are read."""
     has_bodies: bool
     """Whether there are body poses of people, and they are read."""
+    absent: int = 0
+    """Frames of the window that were left out, because a file of them is missing."""
 
     @property
     def images(self) -> Iterator[tuple[int, int]]:

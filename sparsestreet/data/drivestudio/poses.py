@@ -84,4 +84,5 @@ def read_image_stamps(layout: Layout) -> dict[int, tuple[int, ...]]:
 
 
 def _in_window(layout: Layout, path: Path) -> tuple[int, ...]:
-    return read_stamps(path, layout.num_frames_on_disk)[layout.frames.start : layout.frames.stop]
+    stamps = read_stamps(path, layout.num_frames_on_disk)
+    return tuple(stamps[frame] for frame in layout.frames)

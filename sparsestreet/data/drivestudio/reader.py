@@ -11,20 +11,20 @@ from torch import Tensor
 
 from sparsestreet.data.drivestudio.bodies import with_bodies
 from sparsestreet.data.drivestudio.check import check_layout
-from sparsestreet.data.drivestudio.files import hashed_files
+from sparsestreet.data.drivestudio.files import complete, hashed_files
 from sparsestreet.data.drivestudio.flavors import FlavorName
-from sparsestreet.data.drivestudio.frames import read_frame, read_rig, read_views
+from sparsestreet.data.drivestudio.frames import pixel_notes, read_frame, read_rig, read_views
 from sparsestreet.data.drivestudio.instances import read_instances
 from sparsestreet.data.drivestudio.layout import Layout, find_layout
 from sparsestreet.data.drivestudio.poses import first_pose, read_clock, read_vehicle
-from sparsestreet.data.drivestudio.sweeps import read_points
+from sparsestreet.data.drivestudio.sweeps import read_points, sweep_notes
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.notes import absence_notes
 from sparsestreet.data.poses import dataset_from_world, recentered
-from sparsestreet.data.problems import LogError, Problem
+from sparsestreet.data.problems import LogError, Missing, Problem, check_missing, missing_notes
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.scene_folder import SceneFolder
 from sparsestreet.data.tracks import timed_tracks, track_in_window
@@ -68,10 +68,13 @@ class DriveStudioReader(LogReader):
     """Where the scene's box lies (``DrivingLog.first_axes``): "world" or "first_pose"."""
     flavor: FlavorName | None = None
     """The data set that the layout was made of; None: what the files tell, an error where they leave it open."""
+    missing: Missing = "error"
+    """skip: frames of which a file is missing are left out with a note."""
     cache_mb: CacheSize = "auto"
     """Decoded frames kept in memory, MB (1e6 bytes)."""
 
     def __post_init__(self) -> None:
+        check_missing(self.missing)
         if self.extent not in get_args(SceneExtent):
             raise ValueError(f"extent must be one of {', '.join(get_args(SceneExtent))}, got {self.extent!r}")
         if self.lidar_ahead is not None and not (
@@ -125,6 +128,8 @@ class DriveStudioReader(LogReader):
                 *self._without_effect(layout),
                 *(camera.note for camera in rig if camera.note is not None),
                 *people,
+                *pixel_notes(layout),
+                *sweep_notes(layout),
             ),
             first_axes=start[:3, :3] if self.extent == "first_pose" else None,
             vehicle=VehiclePath(recentered(read_vehicle(layout), origin)) if layout.flavor.mounted else None,
@@ -142,7 +147,7 @@ class DriveStudioReader(LogReader):
         return [f"lidar_ahead={list(self.lidar_ahead)} has no effect: {why}"]
 
     def _layout(self) -> Layout:
-        return find_layout(
+        layout = find_layout(
             self.folder,
             cameras=self.cameras,
             first_frame=self.first_frame,
@@ -151,6 +156,7 @@ class DriveStudioReader(LogReader):
             bodies=self.bodies,
             flavor=self.flavor,
         )
+        return complete(layout) if self.missing == "skip" else layout
 
 
 def _read_tracks(layout: Layout, origin: Float64[Tensor, "3"]) -> tuple[tuple[Track, ...], tuple[str, ...]]:
@@ -172,7 +178,8 @@ def _notes(layout: Layout) -> tuple[str, ...]:
         boxes=layout.has_instances,
         clock=layout.has_clock,
     )
-    return (*_note_of_flavor(layout), *absent)
+    skipped = missing_notes(layout.absent, layout.absent + len(layout.frames), "frames")
+    return (*skipped, *_note_of_flavor(layout), *absent)
 
 
 def _note_of_flavor(layout: Layout) -> list[str]:

@@ -11,7 +11,7 @@ from sparsestreet.atomic import check_regular
 from sparsestreet.data.drivestudio.flavors import NAME_IT
 from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.drivestudio.poses import read_pose
-from sparsestreet.data.lidar import check_points
+from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.problems import fault
 from sparsestreet.geometry.transforms import transform_points
 
@@ -39,6 +39,21 @@ def read_sweep(layout: Layout, frame: int, ahead: Sequence[float | int] | None =
 
     ``ahead``: of Waymo's points, which lie in the frame of the vehicle, only those with x between these numbers.
     """
+    points, rays = _read_rows(layout, frame)
+    points = points[returned(points) & returned(rays)]
+    if ahead is not None and layout.flavor.name == "waymo":
+        points = points[(points[:, 0] > ahead[0]) & (points[:, 0] < ahead[1])]
+    return transform_points(read_pose(layout.sweep_pose(frame)), points)
+
+
+def sweep_notes(layout: Layout) -> list[str]:
+    """What is said about points that are no returns."""
+    frames = {layout.sweep(frame): frame for frame in layout.frames} if layout.has_lidar else {}
+    return empty_notes(lambda path: _read_rows(layout, frames[path])[1], list(frames))
+
+
+def _read_rows(layout: Layout, frame: int) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
+    """Points as they are written, and seen from the sensor: in a Waymo row the ray's origin comes before its end."""
     check_sweep_size(layout, frame)
     path = layout.sweep(frame)
     check_regular(path)
@@ -46,6 +61,4 @@ def read_sweep(layout: Layout, frame: int, ahead: Sequence[float | int] | None =
     first = layout.flavor.x_column
     points = torch.from_numpy(rows[:, first : first + 3].astype(np.float64))
     check_points(points, path, remedy=_REMEDY)
-    if ahead is not None and layout.flavor.name == "waymo":
-        points = points[(points[:, 0] > ahead[0]) & (points[:, 0] < ahead[1])]
-    return transform_points(read_pose(layout.sweep_pose(frame)), points)
+    return points, points - torch.from_numpy(rows[:, :3].astype(np.float64)) if first else points

@@ -9,7 +9,7 @@ from sparsestreet.data.marks import Marks
 from sparsestreet.data.nerfstudio.transforms import Transforms, read_transforms
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.posed_images import PosedImages, check_images, recording_of, sort_images
-from sparsestreet.data.problems import LogError, Problem, attempt
+from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_notes
 from sparsestreet.data.recording import RecordedReader, Recording
 
 
@@ -26,6 +26,11 @@ class NerfstudioReader(RecordedReader):
     """Meters to a unit of the file."""
     pinhole_fov: float | None = None
     """Degrees that the pinhole of a fisheye sees from left to right; None: its resolution is that of the center."""
+    missing: Missing = "error"
+    """skip: images that are listed and have no file are left out with a note, before frames are counted."""
+
+    def __post_init__(self) -> None:
+        check_missing(self.missing)
 
     def recording(self) -> Recording:
         transforms, images = self._read()
@@ -58,7 +63,7 @@ class NerfstudioReader(RecordedReader):
         return self.folder / "transforms.json"
 
     def _read(self) -> tuple[Transforms, PosedImages]:
-        transforms = read_transforms(self._table)
+        transforms = read_transforms(self._table, skip=self.missing == "skip")
         images = sort_images(
             transforms.images,
             self._table,
@@ -76,7 +81,9 @@ class NerfstudioReader(RecordedReader):
 
 
 def _notes(transforms: Transforms) -> list[str]:
-    notes = []
+    notes = missing_notes(transforms.absent, transforms.absent + len(transforms.images))
+    if transforms.unread:
+        notes.append(f"nothing reads {', '.join(transforms.unread)} of transforms.json")
     if transforms.has_times:
         notes.append("times of the frames order them, but their unit is not known: they are no clock")
     if transforms.has_depth:

@@ -21,6 +21,17 @@ from sparsestreet.geometry.lenses import BrownConrady, Fisheye, Lens
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _FISHEYE = ("OPENCV_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_RADIAL_FISHEYE")
+_OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "orthographic")
+_NUMBERS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+_READ = (
+    "frames", "file_path", "transform_matrix", "mask_path", "time", "depth_file_path", "ply_file_path", "w", "h", "cx",
+    "cy", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y", "camera_model", "is_fisheye", *_NUMBERS,
+)  # fmt: skip
+_HARMLESS = (
+    "applied_transform", "applied_scale", "aabb", "aabb_scale", "scale", "offset", "orientation_override", "sharpness",
+    "colmap_im_id", "rotation", "comment",
+)  # fmt: skip
+"""What was done before the file was written, or how another program sets up its own volume."""
 _LARGEST_IMAGE = 100_000
 """Pixels on a side."""
 
@@ -34,14 +45,22 @@ class Transforms:
     """The .ply with the sparse points."""
     has_times: bool
     has_depth: bool
+    unread: tuple[str, ...]
+    """Entries that mean something to other programs, and nothing here."""
+    absent: int
+    """Frames that were left out, because their images are missing."""
 
 
-def read_transforms(path: Path) -> Transforms:
-    """Raises LogError with every frame at fault."""
+def read_transforms(path: Path, *, skip: bool = False) -> Transforms:
+    """Raises LogError with every frame at fault. ``skip``: frames without the file of their image are left out."""
     top = read_json(path)
-    frames = top["frames"].items()
-    if not frames:
+    listed = top["frames"].items()
+    if not listed:
         raise top["frames"].fault("is empty", "write at least one frame")
+    frames = [frame for frame in listed if _file(frame).is_file()] if skip else listed
+    if not frames:
+        message = f"has {len(listed)} frames, and the image of none is there, the first is {_file(listed[0])}"
+        raise top["frames"].fault(message, "write the images")
     problems = []
     images = [attempt(problems, lambda frame=frame: _image(top, frame)) for frame in frames]
     if problems:
@@ -58,13 +77,20 @@ def read_transforms(path: Path) -> Transforms:
         None if points is None else points.path(),
         timed > 0,
         any("depth_file_path" in frame for frame in frames),
+        tuple(dict.fromkeys(key for value in (top, *frames) for key in value.unread(_READ + _HARMLESS))),
+        len(listed) - len(frames),
     )
 
 
-def _image(top: JsonValue, frame: JsonValue) -> PosedImage:
+def _file(frame: JsonValue) -> Path:
     path = frame["file_path"].path()
     if not path.suffix and not path.is_file():
         path = path.with_name(path.name + ".png")  # Blender's files leave it out
+    return path
+
+
+def _image(top: JsonValue, frame: JsonValue) -> PosedImage:
+    path = _file(frame)
     lens, size = _lens(top, frame, path)
     mask, time = frame.get("mask_path"), frame.get("time")
     return PosedImage(
@@ -74,7 +100,7 @@ def _image(top: JsonValue, frame: JsonValue) -> PosedImage:
         size,
         _world_from_camera(frame["transform_matrix"]),
         None if mask is None else mask.path(),
-        None if time is None else time.number(),
+        None if time is None else time.moment(),
     )
 
 
@@ -98,18 +124,36 @@ def _lens(top: JsonValue, frame: JsonValue, image: Path) -> tuple[Lens, tuple[in
     fx = _focal(top, frame, "fl_x", "camera_angle_x", size[0], None)
     fy = _focal(top, frame, "fl_y", "camera_angle_y", size[1], fx)
     focal = {"fx": fx, "fy": fy, "cx": number("cx", size[0] / 2), "cy": number("cy", size[1] / 2)}
-    model = value("camera_model")
-    name = "OPENCV" if model is None else model.text()
-    if name in _FISHEYE:
-        return Fisheye(**focal, **{key: number(key) for key in ("k1", "k2", "k3", "k4")}), size
-    if model is not None and name not in _PERSPECTIVE:
+    _refuse_other_lenses(top, frame)
+    fisheye = _is_fisheye(value("camera_model"), value("is_fisheye"))
+    known = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3")
+    for key in _NUMBERS:
+        if key not in known and number(key):
+            remedy = f"write 0, or a camera_model that has it ({'OPENCV' if fisheye else 'OPENCV_FISHEYE'})"
+            raise (value(key) or frame).fault(f"is not 0, but this model has no {key}", remedy)
+    numbers = {key: number(key) for key in known}
+    return (Fisheye if fisheye else BrownConrady)(**focal, **numbers), size
+
+
+def _refuse_other_lenses(*values: JsonValue) -> None:
+    """Instant-ngp names a lens by the keys that are there."""
+    for value in values:
+        for key in _OTHER_LENSES:
+            if key in value and value[key].value is not False:
+                raise value.fault(f"has {key!r}, a lens that is not read", "undistort the images first")
+
+
+def _is_fisheye(model: JsonValue | None, flag: JsonValue | None) -> bool:
+    """By nerfstudio's name of the model, or by instant-ngp's flag. Raises LogError where they contradict each other."""
+    if model is None:
+        return flag is not None and flag.truth()
+    name = model.text()
+    if name not in _FISHEYE + _PERSPECTIVE:
         remedy = f"undistort the images first, or write one of {', '.join(_PERSPECTIVE + _FISHEYE)}"
         raise model.fault(f"is {name[:40]!r}, a lens that is not read", remedy)
-    if number("k4"):
-        raise (value("k4") or frame).fault(
-            "is not 0, but this model has no k4", "write camera_model OPENCV_FISHEYE, or 0"
-        )
-    return BrownConrady(**focal, **{key: number(key) for key in ("k1", "k2", "p1", "p2", "k3")}), size
+    if flag is not None and flag.truth() != (name in _FISHEYE):
+        raise flag.fault(f"is {flag.value}, but camera_model is {name}", "remove the one that is wrong")
+    return name in _FISHEYE
 
 
 def _size(width: JsonValue | None, height: JsonValue | None, image: Path) -> tuple[int, int]:

@@ -58,7 +58,11 @@ class Row:
 
     def stamp(self) -> int:
         """The row's microseconds, in nanoseconds."""
-        return 1000 * self.count("timestamp", _LAST_STAMP)
+        value = self.values.get("timestamp")
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value <= _LAST_STAMP:
+            remedy = "write whole microseconds: seconds are multiplied by 1e6, nanoseconds divided by 1000"
+            raise self.fault("timestamp", f"must be whole microseconds within 0 and {_LAST_STAMP}", value, remedy)
+        return 1000 * value
 
     def numbers(self, field: str, shape: tuple[int, ...]) -> Float64[np.ndarray, "..."]:
         """Finite numbers in lists of this shape."""

@@ -9,12 +9,14 @@ from sparsestreet.data.extent import check_extent
 from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images, check_image_sizes
+from sparsestreet.data.lidar import empty_notes
 from sparsestreet.data.marks import Marks
-from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
+from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_files, missing_notes
 from sparsestreet.data.recording import RecordedReader, Recording, Shot
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.rig_json.part import Part, entry_of, read_masks, read_pixels
-from sparsestreet.data.rig_json.table import read_table
+from sparsestreet.data.rig_json.sweeps import read_rows
+from sparsestreet.data.rig_json.table import read_table, with_files
 from sparsestreet.data.window import chosen_cameras, frame_window
 
 
@@ -27,6 +29,11 @@ class RigJsonReader(RecordedReader):
     pinhole_fov: float | None = None
     """Degrees that the pinhole of a lens that is not simulated sees from left to right; None: its resolution is that of
     the lens's center."""
+    missing: Missing = "error"
+    """skip: images that are listed and have no file are left out with a note, as are frames without any."""
+
+    def __post_init__(self) -> None:
+        check_missing(self.missing)
 
     def recording(self) -> Recording:
         part = self._part()
@@ -64,6 +71,7 @@ class RigJsonReader(RecordedReader):
 
     def _part(self) -> Part:
         table = read_table(self.folder / "rig.json")
+        table = with_files(table) if self.missing == "skip" else table
         window = frame_window(len(table.frames), self.first_frame, self.last_frame, self.folder)
         names = chosen_cameras(list(table.cameras), self.cameras, self.folder)
         places = [place for place in window if not table.frames[place].images.keys().isdisjoint(names)]
@@ -75,7 +83,11 @@ class RigJsonReader(RecordedReader):
     def _notes(self, part: Part) -> tuple[str, ...]:
         window = frame_window(len(part.table.frames), self.first_frame, self.last_frame, self.folder)
         left_out = len(window) - len(part.places)
-        return (f"{left_out} of {len(window)} frames have no image and are left out",) if left_out else ()
+        absent = missing_notes(part.table.absent, part.table.listed)
+        sweeps = [frame.sweep for frame in part.frames if frame.sweep is not None] if self.lidar else []
+        empty = empty_notes(lambda path: read_rows(path, part.table.lidar.columns)[0], sweeps)
+        homeless = [f"{left_out} of {len(window)} frames have no image and are left out"] if left_out else []
+        return (*absent, *homeless, *empty)
 
     def _camera(self, part: Part, index: int) -> RigCamera[str]:
         name = part.cameras[index]
@@ -102,7 +114,11 @@ class RigJsonReader(RecordedReader):
             problems += [_no_pose(part, place) for place in unposed if part.table.frames[place].sweep is not None]
         if self.masks is not None:
             stems = [(part.cameras[shot.camera], shot.stem) for shot in shots]
-            problems += GivenMasks(Path(self.masks)).check(stems)
+            given = GivenMasks(Path(self.masks))
+            problems += given.check(stems)
+            for name in part.cameras if decode else ():
+                own = [(camera, stem) for camera, stem in stems if camera == name]
+                problems += given.check_pixels(own, part.table.cameras[name].size)
         return problems or check_extent([(part.table.path, shot.world_from_camera[:3, 3]) for shot in shots])
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.lidar import check_points
+from sparsestreet.data.lidar import check_points, returned
 from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.problems import fault
@@ -35,10 +35,13 @@ def read_sweep(
     Raises LogError for a file that is missing or holds anything else.
     """
     points, times = read_rows(path, lidar.columns)
+    # Who writes the world's points moves a driver's zeros to the sensor, or leaves them.
+    some = returned(points)
+    points, times = points[some], None if times is None else times[some]
     mount = lidar.vehicle_from_lidar
     check_points(points - reference if mount is None else points, path)
     center = reference if mount is None else torch.zeros(3, dtype=torch.float64)
-    far = (points - center).norm(dim=-1) >= lidar.nearest
+    far = ((points - center).norm(dim=-1) >= lidar.nearest) & returned(points - center)
     points = points[far]
     if mount is None:
         return points

@@ -1,7 +1,7 @@
 """The content of ``rig.json``: cameras, frames, the lidar, boxes."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.data.json_tree import JsonValue, read_json
+from sparsestreet.data.problems import fault
 from sparsestreet.data.recording import Boxes
 from sparsestreet.data.rig_json.values import read_lens, read_pose, read_shutter, read_stamp
 from sparsestreet.geometry.lenses import Lens
@@ -80,6 +81,13 @@ class RigTable:
     lidar: LidarEntry
     frames: Sequence[FrameEntry]
     boxes: Sequence[Boxes] | None
+    absent: int = 0
+    """Images that were left out, because their files are missing."""
+
+    @property
+    def listed(self) -> int:
+        """Images of all frames and cameras, with those that were left out."""
+        return self.absent + sum(len(frame.images) for frame in self.frames)
 
     @property
     def has_clock(self) -> bool:
@@ -107,6 +115,16 @@ def read_table(path: Path) -> RigTable:
         frames,
         None if boxes is None else [_boxes(value, len(frames)) for value in boxes.items()],
     )
+
+
+def with_files(table: RigTable) -> RigTable:
+    """Return the table without images whose files are missing. Raises LogError where none is there."""
+    images = [{n: image for n, image in frame.images.items() if image.path.is_file()} for frame in table.frames]
+    if not any(images):
+        raise fault(table.path, f"none of its {table.listed} images is there", "write the images")
+    absent = table.listed - sum(map(len, images))
+    frames = [replace(frame, images=found) for frame, found in zip(table.frames, images, strict=True)]
+    return replace(table, frames=frames, absent=absent)
 
 
 def _camera(name: str, value: JsonValue) -> CameraEntry:

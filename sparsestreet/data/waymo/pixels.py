@@ -10,6 +10,7 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 from torch import Tensor
 
+from sparsestreet.data.images import colors
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.waymo.segment import REMEDY
 
@@ -73,8 +74,7 @@ def _opened(data: bytes, recorded: tuple[int, int], path: Path, what: str, mode:
                 raise fault(path, f"{what} is {found}, its calibration is for {recorded[0]}x{recorded[1]}", REMEDY)
             if mode is None and image.mode not in ("I;16", "I", "L"):
                 raise fault(path, f"{what} has pixels of the kind {image.mode}, not one number each", REMEDY)
-            image.load()
-            return image.copy() if mode is None else image.convert(mode)
+            return image.copy() if mode is None else colors(image, path)
     except LogError:
         raise
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

@@ -350,3 +350,21 @@ def test_mutated_files_are_read_or_refused(sound, tmp_path):
         except LogError:
             refused += 1
     assert 60 < refused < 120
+
+
+@pytest.mark.parametrize("lines", ["none", "some"])
+def test_every_image_is_read_of_a_list_without_lines_of_observations(lines, tmp_path):
+    write_colmap(tmp_path, PLAN, binary=False)
+    path = tmp_path / "sparse/0/images.txt"
+    images = [line for line in path.read_text().splitlines() if line.endswith(".png")]
+    if lines == "some":
+        images.insert(3, "1.5 2.5 -1 3.5 4.5 7 1 2 3")
+        images.append("")
+    path.write_text("\n".join(images) + "\n")
+    log = ColmapReader(root=tmp_path).read()
+    assert [view.indices for view in log.views] == [(frame, camera) for frame in range(4) for camera in range(2)]
+    path.write_text("\n".join(line.replace("/", "\\") for line in images) + "\n")
+    (tmp_path / "images/front/9.png").unlink()
+    log = ColmapReader(root=tmp_path, missing="skip").read()
+    assert len(log.views) == 7
+    assert "1 of 8 listed images lack files and are left out (data.log.missing=skip)" in log.notes

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.drivestudio.layout import find_layout
@@ -322,3 +323,48 @@ def test_what_is_no_scene_is_told_apart(named, words, tmp_path):
 def test_a_choice_the_log_cannot_give_is_an_error(choice, tmp_path):
     with pytest.raises(ValueError, match="log's"):
         DriveStudioReader(make_nuscenes(tmp_path), **choice).read()
+
+
+@pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
+@pytest.mark.parametrize("gone", ["images/002_0.jpg", "lidar/002.bin"])
+def test_a_frame_that_lacks_a_file_can_be_left_out(make, gone, tmp_path):
+    whole = DriveStudioReader(make(tmp_path, frames=5)).read()
+    (tmp_path / gone).unlink()
+    (problem,) = DriveStudioReader(tmp_path).check()
+    assert "data.log.missing=skip" in problem.remedy
+    reader = DriveStudioReader(tmp_path, missing="skip", first_frame=1)
+    assert reader.check() == []
+    log = reader.read()
+    assert "1 of 4 frames lack files and are left out (data.log.missing=skip)" in log.notes
+    assert list(log.stamps.values()) == [whole.stamps[frame] for frame in (1, 3, 4)]
+    assert torch.equal(log.frames[2].image, whole.frames[6].image)
+    assert log.tracks[0].frames.tolist() == [0, 1, 2]
+    lost = log.tracks[0].world_from_object[1, :3, 3] + log.dataset_from_world[:3, 3]
+    assert torch.equal(lost, whole.tracks[0].world_from_object[3, :3, 3] + whole.dataset_from_world[:3, 3])
+    for path in tmp_path.glob("images/*_1.jpg"):
+        path.unlink()
+    with pytest.raises(LogError, match="are missing"):
+        reader.read()
+
+
+@pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
+def test_points_at_the_sensor_are_dropped_with_their_count(make, tmp_path):
+    expected = DriveStudioReader(make(tmp_path)).read().sweeps[1].points
+    path = tmp_path / "lidar/001.bin"
+    columns = 14 if make is make_waymo else 4
+    rows = np.zeros((3, columns), np.float32)
+    rows[1:, :6] = 0.25  # of Waymo's rows, the ray's origin and its end
+    path.write_bytes(path.read_bytes() + rows.tobytes())
+    log = DriveStudioReader(tmp_path).read()
+    kept = 0 if make is make_waymo else 2
+    assert len(log.sweeps[1].points) == len(expected) + kept
+    (note,) = [note for note in log.notes if "at the sensor itself" in note]
+    assert f"{3 - kept} of {len(expected) + 3} in 001.bin" in note
+
+
+def test_an_object_that_stands_twice_is_no_json(tmp_path):
+    path = make_nuscenes(tmp_path) / "instances/instances_info.json"
+    (entry,) = json.loads(path.read_text()).values()
+    path.write_text(f'{{"0": {json.dumps(entry)}, "0": {json.dumps(entry)}}}')
+    (problem,) = DriveStudioReader(tmp_path).check()
+    assert "names '0' twice" in problem.message

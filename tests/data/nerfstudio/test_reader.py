@@ -11,7 +11,7 @@ from PIL import Image
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nerfstudio import NerfstudioReader
-from sparsestreet.data.problems import LogError
+from sparsestreet.data.problems import LogError, check_missing
 from sparsestreet.data.undistortion import Undistortion
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye
 from sparsestreet.geometry.transforms import inverse
@@ -256,6 +256,7 @@ DAMAGE = {
     "a lens folds": (frame_with(p1=1.0, p2=1.0), "no inverse"),
     "a fisheye folds": (frame_with(camera_model="OPENCV_FISHEYE", k1=-3.0), "folds back"),
     "k4 of a pinhole": (frame_with(k4=0.1), "this model has no k4"),
+    "a time not finite": (frame_with(time=math.nan), r"frames\[3\]\.time is nan, no time"),
     "some times": (frame_with(time=0.5), "has a time in 1 of 8 frames"),
     "no mask": (frame_with(mask_path="none.png"), "none.png: the file is missing"),
     "no points": (top_with(ply_file_path="none.ply"), "none.ply: the file is missing"),
@@ -318,3 +319,96 @@ def test_broken_pixels_and_points_are_found_by_the_check(written):
         log.frames[2]
     with pytest.raises(LogError, match=r"sparse_pc\.ply: the header does not describe points"):
         there(log.sparse_points)()
+
+
+def test_a_transparent_pixel_is_not_used_nor_is_its_color(written):
+    folder, _ = written
+    clear = np.zeros((24, 32), bool)
+    clear[3:, :7] = True
+    for frame in range(4):
+        pixels = PLAN.image(frame, PLAN.cameras[0]).copy()
+        pixels[clear] = (255, 0, 255)
+        Image.fromarray(np.dstack([pixels, 255 * ~clear]).astype(np.uint8)).save(
+            folder / f"images/front/frame_{frame + 8}.png"
+        )
+    log = NerfstudioReader(root=folder).read()
+    assert "4 images of camera images/front have alpha" in " ".join(log.notes)
+    assert torch.equal(there(log.frames[2].ego), torch.from_numpy(clear))
+    assert log.frames[3].ego is None
+
+
+def test_instant_ngps_flag_is_a_fisheye_and_what_nothing_reads_is_said(written):
+    folder, content = written
+    flagged = at_the_top(content, is_fisheye=True, **FISHEYE) | {"aabb_scale": 16, "train_filenames": []}
+    flagged["frames"][1]["exposure"] = 0.1
+    write_json(folder, flagged)
+    named = NerfstudioReader(root=folder).read()
+    write_json(folder, at_the_top(content, camera_model="OPENCV_FISHEYE", **FISHEYE))
+    assert torch.equal(named.frames[1].image, NerfstudioReader(root=folder).read().frames[1].image)
+    assert "nothing reads train_filenames, exposure of transforms.json" in named.notes
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"is_fisheye": True, "camera_model": "OPENCV"}, "is_fisheye is True, but camera_model is OPENCV"),
+        ({"is_fisheye": True, "p1": 0.1}, "p1 is not 0, but this model has no p1"),
+        ({"k6": 0.1}, "k6 is not 0, but this model has no k6"),
+        ({"ftheta_p0": 1.0}, "has 'ftheta_p0', a lens that is not read"),
+    ],
+)
+def test_numbers_that_contradict_the_lens_are_refused(values, said, written):
+    folder, content = written
+    write_json(folder, at_the_top(content, fl_x=30.0, **values))
+    with pytest.raises(LogError, match=said):
+        NerfstudioReader(root=folder).read()
+
+
+def test_scattered_missing_images_can_be_left_out(written):
+    folder, content = written
+    for name in ("front/frame_9", "left/frame_9", "left/frame_10"):
+        (folder / f"images/{name}.png").unlink()
+    with pytest.raises(LogError, match=r"data\.log\.missing=skip"):
+        NerfstudioReader(root=folder).read()
+    for frame in content["frames"]:
+        frame["w"] = frame["h"] = None  # sizes are then those of the files
+    write_json(folder, content)
+    reader = NerfstudioReader(root=folder, missing="skip")
+    assert reader.check() == []
+    log = reader.read()
+    assert "3 of 8 listed images lack files and are left out (data.log.missing=skip)" in log.notes
+    assert [view.indices for view in log.views] == [(0, 0), (0, 1), (1, 0), (2, 0), (2, 1)]
+    with pytest.raises(ValueError, match="missing must be one of error, skip, got 'drop'"):
+        check_missing("drop")
+    for path in (folder / "images").rglob("*.png"):
+        path.unlink()
+    with pytest.raises(LogError, match="has 8 frames, and the image of none is there"):
+        reader.read()
+
+
+def test_files_named_on_windows_and_times_in_nanoseconds(written):
+    folder, content = written
+    for frame in content["frames"]:
+        number = int(frame["file_path"].split("_")[-1].removesuffix(".png"))
+        frame["file_path"] = frame["file_path"].replace("/", "\\")
+        # A float has steps of 256 here.
+        frame["time"] = 1_700_000_000_000_000_000 - number
+    write_json(folder, content)
+    log = NerfstudioReader(root=folder).read()
+    assert log.camera_names == ("images/front", "images/left")
+    assert (log.frames[0].image.numpy() == PLAN.image(3, PLAN.cameras[0])).all()
+    content["frames"][0]["file_path"] = "C:\\drive\\000.png"
+    write_json(folder, content)
+    with pytest.raises(LogError, match="no file below the folder of transforms"):
+        NerfstudioReader(root=folder).read()
+
+
+def test_masks_of_the_user_are_decoded_by_the_check(written):
+    folder, _ = written
+    user = folder / "masks" / "sky" / "images" / "left"
+    user.mkdir(parents=True)
+    labels = np.tile(np.array([0, 2, 10, 2], np.uint8), (24, 8))
+    for frame in range(4):
+        Image.fromarray(labels if frame == 2 else 0 * labels).save(user / f"frame_{frame + 8}.png")
+    (problem,) = NerfstudioReader(root=folder, masks=folder / "masks").check()
+    assert (problem.path.name, "3 values" in problem.message) == ("frame_10.png", True)

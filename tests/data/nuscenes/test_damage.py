@@ -118,12 +118,17 @@ DAMAGES: dict[str, tuple[Damage, str, str]] = {
     "a stamp as text": (
         setting("sample_data", 1, timestamp="1"),
         "sample_data.json",
-        "timestamp must be a whole number",
+        "timestamp must be whole microseconds",
     ),
     "a stamp beyond 64 bits": (
         setting("sample_data", 1, timestamp=2**62),
         "sample_data.json",
-        "timestamp must be a whole",
+        "timestamp must be whole microseconds",
+    ),
+    "a stamp in nanoseconds, as a float": (
+        setting("sample_data", 1, timestamp=1.67e18),
+        "sample_data.json",
+        "timestamp must be whole microseconds within 0 and 9223372036854775, got 1.67e+18",
     ),
     "a keyframe far from its sample": (
         setting("sample_data", 1, timestamp=9),

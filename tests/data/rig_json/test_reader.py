@@ -11,6 +11,7 @@ from PIL import Image
 from plyfile import PlyData, PlyElement
 
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.problems import LogError
 from sparsestreet.data.recording import Recording
 from sparsestreet.data.rig_json import RigJsonReader
 from sparsestreet.data.rig_json.values import LENSES
@@ -263,3 +264,44 @@ def test_an_image_without_a_camera_in_the_window(root, written):
     write_json(folder, content)
     with pytest.raises(ValueError, match="frames 0 to 1 have no image of left"):
         RigJsonReader(root=folder, cameras=["left"], last_frame=1).read()
+
+
+def test_two_objects_of_one_name_are_refused_and_two_names_of_one_case_are_kept(written):
+    folder, content = written
+    other = content["boxes"][0] | {"name": content["boxes"][0]["name"].upper()}
+    write_json(folder, content | {"boxes": [*content["boxes"], other]})
+    assert len(RigJsonReader(root=folder).read().tracks) == 2
+    write_json(folder, content | {"boxes": content["boxes"] * 2})
+    with pytest.raises(LogError, match="two objects are named"):
+        RigJsonReader(root=folder).read()
+
+
+@pytest.mark.parametrize("mounted", [True, False])
+def test_points_at_the_sensor_are_dropped_with_their_count(mounted, written):
+    folder, content = written
+    expected = RigJsonReader(root=folder).read().sweeps[1].points
+    for frame in range(4):
+        path = folder / f"lidar/{frame:03d}.npy"
+        rows = np.load(path)
+        if mounted:
+            np.save(path, np.concatenate((rows, np.zeros((5, 4)), [[0.0, 5e-4, 0, 0]], [[0, 0.02, 0, 0]])))
+        else:
+            np.save(path, np.concatenate((PLAN.world_points(frame), np.zeros((6, 3)))))
+    if not mounted:
+        write_json(folder, content | {"lidar": {}})
+    log = RigJsonReader(root=folder).read()
+    assert len(log.sweeps[1].points) == len(expected) + mounted
+    (note,) = [note for note in log.notes if "at the sensor itself" in note]
+    assert note.startswith("points at the sensor itself are no returns and are dropped, such as 6 of")
+
+
+def test_missing_images_are_left_out(written):
+    folder, _ = written
+    for name in ("front/001", "left/001", "left/002"):
+        (folder / f"{name}.png").unlink()
+    with pytest.raises(LogError, match="missing=skip"):
+        RigJsonReader(root=folder).read()
+    log = RigJsonReader(root=folder, missing="skip").read()
+    assert [view.indices for view in log.views] == [(0, 0), (0, 1), (1, 0), (2, 0), (2, 1)]
+    assert log.stamps[1] == PLAN.image_stamp(2, PLAN.cameras[0])
+    assert "3 of 8 listed images lack files and are left out (data.log.missing=skip)" in log.notes
