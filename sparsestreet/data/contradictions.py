@@ -15,7 +15,8 @@ from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import Camera, Frame, SparsePoints, Track, View
 
 _MIDDLE = 0.25
-"""Of width and height, the least distance of a principal point from a border. Of Waymo's cropped side images the center is at 0.27 and 0.28 of the height."""
+"""Of width and height, the least distance of a principal point from a border: 0.27 and 0.28 of the height in Waymo's
+cropped side images."""
 _EXCHANGED = 0.05
 """Of a side: cx this near to half the height, and cy to half the width, are each other."""
 _RATES = 0.1, 1000.0
@@ -43,7 +44,7 @@ _CHANGED = 6.0, 0.4
 and KITTI's drive 0001 (0.3 in a street by night), 0.12 to 0.25 for standing cameras. Of these, one beside which cars
 pass closely has up to 0.88."""
 _STRAY = 1.0
-"""Meters that a box may lie beside its neighbors' line whatever its stamp. KITTI's have up to 0.11 m, at 2 Hz 0.18 m."""
+"""Meters that a box may lie beside its neighbors' line whatever its stamp: KITTI's have up to 0.11, at 2 Hz 0.18."""
 _BIG = 1.5
 """Meters, the length of an object that cannot turn round within a second, and that is larger than its shell."""
 _SWEEPS, _POINTS = 12, 20_000
@@ -133,8 +134,8 @@ def _clock(cameras: Sequence[tuple[str, Frames]]) -> Iterator[str]:
                 ", or lengths in another unit than meters" if rate <= _RATES[1] else ""
             )
             yield (
-                f"by poses and stamps camera {name} moves by {_said(speed)} m/s and takes {_said(rate)} images a second: "
-                f"the stamps may be in {slow if rate < _RATES[0] else fast}"
+                f"by poses and stamps camera {name} moves by {_said(speed)} m/s and takes {_said(rate)} images a "
+                f"second: the stamps may be in {slow if rate < _RATES[0] else fast}"
             )
             return
 
