@@ -93,7 +93,8 @@ def contradictions(log: DrivingLog, frames: Frames, names: Sequence[str]) -> Ite
     yield from _frozen(cameras)
     yield from _box_returns(log)
     if log.sparse_points is not None:
-        yield from _unseen(log.sparse_points(), frames, cameras)
+        yield from (points := log.sparse_points()).notes
+        yield from _unseen(points, frames, cameras)
 
 
 def _first(sentences: Sequence[str]) -> Iterator[str]:
