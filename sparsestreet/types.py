@@ -9,6 +9,7 @@ Conventions, everywhere:
 - Images are float32 in [0, 1] at the splat op, and uint8 in storage.
 """
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -16,8 +17,21 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 
+from sparsestreet.finite import check_finite, check_rows
+
+_RIGIDITY = 1e-3
+"""Largest entry of R^T R - I of a box's pose; readers are stricter (``data.poses``)."""
+
 Side = Literal["top", "bottom", "left", "right"]
 """A side of an image."""
+
+
+def _check_times(time: float, seconds: float | None) -> None:
+    if not math.isfinite(time) or (seconds is not None and not math.isfinite(seconds)):
+        raise ValueError(
+            f"times must be finite numbers, got time {time} and seconds {seconds}: take them from the log's views, or "
+            "between them"
+        )
 
 
 @dataclass(frozen=True)
@@ -122,7 +136,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """A camera and a time at which a scene is seen."""
+    """A camera and a time at which a scene is seen. Raises ValueError for times that are not finite."""
 
     camera: Camera
     time: float
@@ -135,6 +149,9 @@ class View:
     """Seconds since the first stamp of the log; None: the log has no clock."""
     stamp: int | None = None
     """Nanoseconds on the log's own clock, whose zero is arbitrary; None: no clock, or between the recorded frames."""
+
+    def __post_init__(self) -> None:
+        _check_times(self.time, self.seconds)
 
     @property
     def indices(self) -> tuple[int, int]:
@@ -168,7 +185,8 @@ class Frame(View):
 
 @dataclass(frozen=True)
 class Sweep:
-    """Lidar points of one instant in the world frame, with colors where a camera of that instant sees them."""
+    """Lidar points of one instant in the world frame, with colors where a camera of that instant sees them. Raises
+    ValueError for times that are not finite."""
 
     index: int
     time: float
@@ -182,6 +200,9 @@ class Sweep:
     stamp: int | None = None
     """Nanoseconds on the log's own clock; None: it has none."""
 
+    def __post_init__(self) -> None:
+        _check_times(self.time, self.seconds)
+
 
 @dataclass(frozen=True)
 class SparsePoints:
@@ -191,6 +212,8 @@ class SparsePoints:
     """World, meters."""
     colors: Float[Tensor, "n 3"]
     """RGB in [0, 1]; gray 0.5 where it is not known."""
+    notes: tuple[str, ...] = ()
+    """What of them was lost or guessed, one sentence each."""
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -213,7 +236,11 @@ class BodyPoses:
 
 @dataclass(frozen=True)
 class Track:
-    """One annotated object. Its box frame has x along the length (heading), y left, z up, the origin at the center."""
+    """One annotated object. Its box frame has x along the length (heading), y left, z up, the origin at the center.
+
+    Raises ValueError for a size that is not positive, for poses and times that are not finite, poses that are no rigid
+    motion, and frames or times that do not increase.
+    """
 
     name: str
     class_name: str
@@ -229,6 +256,26 @@ class Track:
     span: tuple[float, float] | None = None
     """Normalized times of the first and last image or box of the annotated frames, between which it is there; None:
     from the first box to the last."""
+
+    def __post_init__(self) -> None:
+        what, poses = f"object {self.name} ({self.class_name})", self.world_from_object
+        good = (self.size > 0) & torch.isfinite(self.size)
+        remedy = "write length, width and height in meters, or leave the object out"
+        check_rows(f"the size of {what}", self.size, good, "must be positive and finite", remedy, row="side")
+        remedy = "leave that box out, or write its pose again"
+        check_finite({f"a pose of {what}": poses}, remedy, row="box")
+        rotations = poses[:, :3, :3]
+        bent = rotations.mT @ rotations - torch.eye(3, dtype=poses.dtype, device=poses.device)
+        last = poses[:, 3] - poses.new_tensor([0.0, 0.0, 0.0, 1.0])
+        error = torch.maximum(bent.abs().amax((1, 2)), last.abs().amax(1))
+        # Of a mirrored box R^T R is right too.
+        error = torch.where(torch.linalg.det(rotations) > 0, error, error.clamp(min=2.0))
+        invariant = f"must be a rotation and a translation, R^T R - I at most {_RIGIDITY:g}"
+        check_rows(f"each pose of {what}", error, error <= _RIGIDITY, invariant, remedy, row="box")
+        orders = {"frames": self.frames, "times": self.times}
+        for name, values in ((name, values) for name, values in orders.items() if values is not None):
+            later = torch.cat((torch.ones_like(values[:1], dtype=torch.bool), values.diff() > 0)) & values.isfinite()
+            check_rows(f"the {name} of {what}", values, later, "must increase", "sort its boxes, one each", row="box")
 
     @property
     def path_length(self) -> float:

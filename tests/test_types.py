@@ -1,11 +1,12 @@
 """What the frozen values that rooms hand to each other refuse to answer."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from sparsestreet.types import Camera, Rendering, Track
+from sparsestreet.types import Camera, Frame, Rendering, Sweep, Track
 from tests.scene.street import view_at
 
 
@@ -43,3 +44,64 @@ def test_screen_gradients_are_there_after_a_backward_pass_only():
     cotangent = torch.arange(6.0).reshape(3, 2)
     (offsets * cotangent).sum().backward()
     assert torch.equal(rendering.screen_gradients, cotangent)
+
+
+TURN = torch.tensor([[0.6, -0.8, 0, 7], [0.8, 0.6, 0, -2], [0, 0, 1, 1], [0, 0, 0, 1]], dtype=torch.float64)
+
+
+def boxes(**changes) -> Track:
+    given = {
+        "frames": torch.tensor([2, 3, 7]),
+        "world_from_object": TURN.repeat(3, 1, 1),
+        "size": torch.tensor([4.0, 2.0, 1.5]),
+        "times": torch.tensor([0.1, 0.2, 0.9], dtype=torch.float64),
+    }
+    return Track("it", "car", **{**given, **changes})
+
+
+def posed(value: float, row: int, column: int) -> torch.Tensor:
+    poses = TURN.repeat(3, 1, 1)
+    poses[1, row, column] = value
+    return poses
+
+
+WRONG = {
+    "a size of 0": ({"size": torch.tensor([4.0, 0.0, 1.5])}, "side 1 has 0.0"),
+    "a negative size": ({"size": torch.tensor([-4.0, 2.0, 1.5])}, "side 0 has -4.0"),
+    "a size of NaN": ({"size": torch.tensor([4.0, 2.0, math.nan])}, "side 2 has nan"),
+    "an infinite size": ({"size": torch.tensor([math.inf, 2.0, 1.5])}, "side 0 has inf"),
+    "a pose of NaN": ({"world_from_object": posed(math.nan, 0, 3)}, "must be finite, but box 1 has nan"),
+    "an infinite pose": ({"world_from_object": posed(-math.inf, 2, 3)}, "must be finite, but box 1 has -inf"),
+    "a scaled pose": (
+        {"world_from_object": posed(1.1, 2, 2)},
+        "must be a rotation and a translation, .* box 1 has 0.21",
+    ),
+    "a mirrored pose": ({"world_from_object": posed(-1.0, 2, 2)}, "must be a rotation and a translation, .* box 1"),
+    "a last row": ({"world_from_object": posed(2.0, 3, 3)}, "must be a rotation and a translation, .* box 1 has 1.0"),
+    "a frame twice": ({"frames": torch.tensor([2, 7, 7])}, "the frames of object it .* must increase, but box 2 has 7"),
+    "frames out of order": ({"frames": torch.tensor([2, 1, 7])}, "must increase, but box 1 has 1"),
+    "a time of NaN": ({"times": torch.tensor([0.1, math.nan, 0.9]).double()}, "the times of .* box 1 has nan"),
+    "times that fall": ({"times": torch.tensor([0.1, 0.9, 0.2]).double()}, "the times of .* box 2 has 0.2"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_boxes_that_cannot_be_are_refused_by_object_and_box(name):
+    boxes()
+    changes, said = WRONG[name]
+    with pytest.raises(ValueError, match=said) as caught:
+        boxes(**changes)
+    assert "object it (car)" in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_times_that_are_no_numbers_are_refused(value):
+    view = view_at(0.25)
+    image = torch.zeros(view.camera.height, view.camera.width, 3, dtype=torch.uint8)
+    frame = Frame.of(view, image=image)
+    sweep = Sweep(0, 0.25, torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1, dtype=torch.bool))
+    for one in (view, frame, sweep):
+        assert replace(one, time=-3.0, seconds=-1.0).time == -3.0  # beside the log is a time
+        for name in ("time", "seconds"):
+            with pytest.raises(ValueError, match="times must be finite numbers, got time"):
+                replace(one, **{name: value})

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Sequence
 import torch
 from torch import Tensor
 
+from sparsestreet.data.contradictions import contradictions
 from sparsestreet.data.ego import used_share
 from sparsestreet.data.followed import FEWEST, followed
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.types import Track, View
+from sparsestreet.types import Track
 
 MOST_FRAMES = 36
 """Images that are looked at."""
@@ -20,10 +21,6 @@ _FLAT = 3.0
 """Gray levels, standard deviation over an image, below which it shows nothing."""
 _UNLIKE = 1.0
 """Of ``followed``: 0.3 to 0.8 where poses are right, 1.03 and more where the axes of a camera are swapped."""
-_ACCELERATION = 30.0
-"""Meters per second squared; three times what tires hold."""
-_OUTLYING = 10.0
-"""Times the median acceleration of a camera: poses that tremble have no single one that is wrong."""
 _SAME = 0.25
 """Of the sides of a box: a second center this near is that of the same object, if its volume is half as large."""
 
@@ -38,7 +35,7 @@ def doubts(log: DrivingLog, frames: Frames | None = None) -> tuple[str, ...]:
     return (
         *_covered(frames, names),
         *_swapped(frames, log, names),
-        *_jumps(frames.views, names),
+        *contradictions(log, frames, names),
         *_shared_boxes(log.tracks),
     )
 
@@ -85,26 +82,6 @@ def _swapped(frames: Frames, log: DrivingLog, names: Sequence[str]) -> Iterator[
                 f"returns of the lidar change their gray level {change:.1f} times as much if camera {names[camera]} is "
                 "followed along its poses as if it stood still: check the axes of camera and poses (OpenCV: x right, y "
                 "down, z ahead) and the stamps, or mask the recording car where the image shows it (data.log.masks)"
-            )
-
-
-def _jumps(views: Sequence[View], names: Sequence[str]) -> Iterator[str]:
-    """The worst of each camera."""
-    for camera in sorted({view.indices[1] for view in views}):
-        own = [view for view in views if view.indices[1] == camera and view.seconds is not None]
-        if len(own) < 4:
-            continue
-        seconds = torch.tensor([view.seconds for view in own], dtype=torch.float64)
-        steps = seconds.diff().clamp(min=1e-3)
-        velocities = torch.stack([view.camera.position for view in own]).double().diff(dim=0) / steps[:, None]
-        changes = velocities.diff(dim=0).norm(dim=1) / ((steps[1:] + steps[:-1]) / 2)
-        worst = float(changes.max())
-        if worst > max(_ACCELERATION, _OUTLYING * float(changes.median())):
-            # A wrong frame changes the steps on both of its sides, and with them three accelerations.
-            three = torch.nn.functional.pad(changes, (1, 1)).unfold(0, 3, 1).sum(1)
-            yield (
-                f"by its poses and stamps camera {names[camera]} is accelerated by {worst:.0f} m/s^2 around frame "
-                f"{own[int(three.argmax()) + 1].indices[0]}: check pose and stamp there"
             )
 
 

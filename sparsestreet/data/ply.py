@@ -6,7 +6,7 @@ from typing import BinaryIO
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
@@ -26,11 +26,20 @@ _HEADER_LINES = 200
 _LINE = 4096
 """Bytes of a header's line, and of a point's in text."""
 _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
+_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""Of colors, in the order in which they are looked for; then those of Gaussians."""
+_HARMONICS = ("f_dc_0", "f_dc_1", "f_dc_2")
+_Y00 = 0.28209479177387814
+"""The constant harmonic, 1 / sqrt(4 pi)."""
+_ONE = 1.001
+"""The largest of fractions, rounded by whoever wrote them."""
 _REMEDY = "write a .ply whose first element is vertex, with x, y, z (and red, green, blue), in text or binary"
 
 
 def read_ply(path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    """Positions, and RGB in [0, 1] (gray 0.5 without colors). Raises LogError for any file that is not of such points.
+    """Return positions, and RGB in [0, 1] (gray 0.5 without colors; of Gaussians, their constant term).
+
+    Raises LogError for any file that is not of such points.
 
     No memory is taken that the file's own size does not justify.
     """
@@ -104,12 +113,24 @@ def _broken_row(path: Path, index: int, wanted: int, words: list[bytes]) -> LogE
     return fault(path, f"point {index} is {found!r}, not {wanted} numbers", "write the file again")
 
 
-def _colors(rows: np.ndarray, types: dict[str, str]) -> np.ndarray:
-    """RGB in [0, 1]: counts of 0 to 255, unless they are fractions."""
-    if not {"red", "green", "blue"} <= types.keys():
+def _colors(rows: np.ndarray, types: dict[str, str]) -> Float32[np.ndarray, "n 3"]:
+    """RGB in [0, 1], whatever its columns are called and counted in; gray where it is not a number."""
+    names = next((names for names in (*_NAMES, _HARMONICS) if set(names) <= types.keys()), None)
+    if names is None or not len(rows):
         return np.full((len(rows), 3), 0.5, dtype=np.float32)
-    colors = np.stack([rows[name].astype(np.float32) for name in ("red", "green", "blue")], 1)
-    kind = np.dtype(types["red"])
-    if kind.kind != "f":
-        colors = colors / np.float32(np.iinfo(kind).max)
-    return np.nan_to_num(colors, nan=0.5).clip(0, 1)
+    colors = np.stack([rows[name].astype(np.float64) for name in names], 1)
+    if names == _HARMONICS:
+        colors = 0.5 + _Y00 * colors
+    else:
+        colors /= _full(np.dtype(types[names[0]]), colors)
+    return np.nan_to_num(colors, nan=0.5).clip(0, 1).astype(np.float32)
+
+
+def _full(kind: np.dtype, colors: np.ndarray) -> float:
+    """What white is: told by the type of bytes alone, else by the largest value too, as many write bytes in others."""
+    if kind.itemsize == 1:
+        return float(np.iinfo(kind).max)
+    largest = colors.max(initial=0.0, where=np.isfinite(colors))
+    if kind.kind == "f" and largest <= _ONE:
+        return 1.0
+    return next((float(full) for full in (255, 65535) if largest <= full), float(largest))

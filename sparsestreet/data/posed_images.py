@@ -140,6 +140,7 @@ def recording_of(
     scale: float,
     pinhole_fov: float | None,
     sparse_points: SparsePointsReader | None,
+    points_file: Path | None,
     notes: Sequence[str],
 ) -> Recording:
     """The recording of sound images, ``scale`` meters to a unit. Raises ValueError for a scale that is not positive."""
@@ -173,6 +174,7 @@ def recording_of(
         read_masks=partial(_masks, rig, given),
         mask_kinds=kinds | {"ego"} if has_own else kinds,
         sparse_points=None if sparse_points is None else partial(_scaled_points, sparse_points, scale),
+        points_file=points_file,
         notes=(_note_of_scale(shots, scale), *notes),
     )
 

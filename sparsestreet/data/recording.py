@@ -116,7 +116,10 @@ class Recording:
     """Instants that the data set annotates, also those outside of the window; None: all. In between an object is on its
     way from one to the next if both have it; boxes need stamps then."""
     sparse_points: Callable[[], tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]] | None = None
-    """Positions in the data set's own world and RGB in [0, 1] of points that came with it, such as COLMAP's."""
+    """Positions in the data set's own world and RGB in [0, 1] of points that came with it, such as COLMAP's. Those that
+    are not finite are left out later."""
+    points_file: Path | None = None
+    """Where they are from."""
     vehicle: PosePath | None = None
     """The car in the data set's own world, x ahead, y left, z up; None: the data set does not tell."""
     notes: tuple[str, ...] = ()
@@ -340,7 +343,17 @@ def _points(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], inde
 def _sparse_points(recording: Recording, origin: Float64[Tensor, "3"]) -> SparsePoints:
     assert recording.sparse_points is not None  # else it is not asked
     positions, colors = recording.sparse_points()
-    return SparsePoints((positions - origin).float(), colors)
+    places = (positions - origin).float()
+    finite, where = torch.isfinite(places).all(1), f" of {recording.points_file}" if recording.points_file else ""
+    notes = []
+    if not finite.all():
+        lost = torch.nonzero(~finite).flatten()
+        notes = [
+            f"{len(lost)} of {len(places)} points{where} are not finite, the first is point {int(lost[0])}: left out"
+        ]
+    if len(colors) and bool((colors == 0.5).all()):
+        notes.append(f"the points{where} have no colors that are known (red, green, blue, or f_dc_0): they are gray")
+    return SparsePoints(places[finite], colors[finite], tuple(notes))
 
 
 def _absent(recording: Recording) -> tuple[str, ...]:

@@ -98,3 +98,38 @@ def test_mutated_files_are_read_or_refused(form, tmp_path):
         except LogError:
             refused += 1
     assert 20 < refused < 200
+
+
+WHITE = np.array([[200, 100, 50], [0, 255, 3]])
+KINDS = {
+    "bytes": ("u1", ("red", "green", "blue"), WHITE),
+    "16 bits": ("u2", ("red", "green", "blue"), WHITE * 257),
+    "bytes in 16 bits": ("u2", ("red", "green", "blue"), WHITE),
+    "bytes in 32 bits": ("i4", ("r", "g", "b"), WHITE),
+    "fractions": ("f4", ("red", "green", "blue"), WHITE / 255),
+    "fractions in doubles, rounded": ("f8", ("r", "g", "b"), WHITE / 254.9),
+    "bytes in floats": ("f4", ("red", "green", "blue"), WHITE),
+    "16 bits in doubles": ("f8", ("diffuse_red", "diffuse_green", "diffuse_blue"), WHITE * 257),
+    "diffuse": ("u1", ("diffuse_red", "diffuse_green", "diffuse_blue"), WHITE),
+    "Gaussians": ("f4", ("f_dc_0", "f_dc_1", "f_dc_2"), (WHITE / 255 - 0.5) * 2 * np.sqrt(np.pi)),
+    "no names that are known": ("u1", ("c0", "c1", "c2"), np.full((2, 3), 127.5)),
+}
+
+
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize("name", KINDS)
+def test_colors_are_read_whatever_they_are_called_and_counted_in(name, text, tmp_path):
+    kind, names, values = KINDS[name]
+    rows = np.zeros(len(values), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4"), *((one, kind) for one in names)])
+    for index, one in enumerate(names):
+        rows[one] = values[:, index]
+    PlyData([PlyElement.describe(rows, "vertex")], text=text).write(tmp_path / "a.ply")
+    expected = np.full((2, 3), 0.5) if name.startswith("no") else WHITE / 255
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply")[1].numpy(), expected, atol=1e-3 if "254" in name else 5e-4)
+
+
+def test_a_color_that_is_no_number_is_gray(tmp_path):
+    rows = np.zeros(2, dtype=[(one, "f4") for one in ("x", "y", "z", "red", "green", "blue")])
+    rows["red"], rows["green"] = [np.nan, 255], [np.inf, 51]
+    PlyData([PlyElement.describe(rows, "vertex")]).write(tmp_path / "a.ply")
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply")[1].numpy(), [[0.5, 1, 0], [1, 0.2, 0]], atol=1e-6)

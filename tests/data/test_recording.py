@@ -1,5 +1,7 @@
 """The log that follows from what a reader found: here, of a camera whose lens is taken out of its images."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import NoReturn
 
@@ -8,6 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from sparsestreet.data.doubts import doubts
 from sparsestreet.data.problems import fault
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera
@@ -70,6 +73,27 @@ def test_points_that_came_with_the_log_are_in_its_world_and_give_no_depth():
     assert len(reads) == 1
     assert log.frames[0].depth is None
     assert not len(log.sweeps)
+
+
+@pytest.mark.parametrize("broken", [math.nan, math.inf, -1e39])
+def test_points_that_are_not_finite_are_left_out_and_gray_ones_are_told(broken):
+    """-1e39 m is finite in the file, and not in float32."""
+    places = torch.tensor([[0.0, 1.0, 5.0]] * 5, dtype=torch.float64)
+    places[3, 1], places[4, 2] = broken, math.nan
+    recording = Recording(
+        name="a",
+        rig=[camera(FLAT)],
+        shots=[Shot(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
+        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
+        read_masks=lambda shot: {},
+        sparse_points=lambda: (places, torch.full((5, 3), 0.5)),
+        points_file=Path("cloud.ply"),
+    )
+    log = log_of(recording, cache_bytes=0, check=list)
+    assert there(log.sparse_points)().positions.tolist() == [[0.0, 1.0, 5.0]] * 3
+    lost, gray = doubts(replace(log, frames=log.frames[:0]))
+    assert lost == "2 of 5 points of cloud.ply are not finite, the first is point 3: left out"
+    assert gray.startswith("the points of cloud.ply have no colors that are known")
 
 
 def test_the_recording_car_has_no_returns():

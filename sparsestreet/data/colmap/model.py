@@ -69,8 +69,6 @@ def read_images(model: SparseModel, folder: Path) -> list[PosedImage]:
 def read_points(path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """Positions, and RGB in [0, 1]. Raises LogError for a broken file."""
     positions, colors = binary.points(path) if path.suffix == ".bin" else text.points(path)
-    if not np.isfinite(positions).all():
-        raise fault(path, "a point is NaN or infinite", "run the reconstruction again")
     return torch.from_numpy(positions), torch.from_numpy(colors.astype(np.float32) / 255)
 
 

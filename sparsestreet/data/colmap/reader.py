@@ -53,6 +53,7 @@ class ColmapReader(RecordedReader):
             scale=self.scale,
             pinhole_fov=self.pinhole_fov,
             sparse_points=None if model.points is None else partial(read_points, model.points),
+            points_file=model.points,
             notes=[*absent, "the model has no points" if model.points is None else _HELD_OUT],
         )
 

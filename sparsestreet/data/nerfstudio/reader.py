@@ -43,6 +43,7 @@ class NerfstudioReader(RecordedReader):
             scale=self.scale,
             pinhole_fov=self.pinhole_fov,
             sparse_points=None if transforms.points is None else partial(read_ply, transforms.points),
+            points_file=transforms.points,
             notes=_notes(transforms),
         )
 

@@ -281,7 +281,6 @@ BYTES = {
         "cut short": (lambda content: content[:-1], "the file ends within point"),
         "too many": (lambda content: b"\xff" * 8 + content[8:], "it announces .* points, but"),
         "a track too long": (lambda content: content[:51] + b"\xff" * 8 + content[59:], "the file ends within point 0"),
-        "not finite": (lambda content: content[:16] + b"\xff" * 8 + content[24:], "a point is NaN or infinite"),
     },
     "cameras.txt": {
         "an unknown model": (replaced(b"PINHOLE", b"MIRROR"), "line 2: its model is 'MIRROR'"),
