@@ -71,8 +71,8 @@ def _convert(words: _Words, to: Path) -> int:
     )
     for sentence in made.losses:
         print(f"  lost or changed: {sentence}")
-    for sentence in made.doubts:
-        print(f"  doubt: {sentence}")
+    for sentence in made.notes:
+        print(f"  note: {sentence}")
     return 0
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.auto import AUTO, with_found_data
+from sparsestreet.cli.checks import unresolvable
 from sparsestreet.cli.compose import as_typed, composed, override_problem
 from sparsestreet.cli.targets import made
 from sparsestreet.data.reader import LogReader
@@ -43,6 +44,8 @@ def configured_log(
         OmegaConf.update(cfg, "data.root", str(folder))
     if OmegaConf.is_missing(cfg.data, "root"):
         raise UsageError(no_log)
+    if problem := unresolvable(cfg.data.log):
+        raise UsageError(problem)
     if missing := sorted(OmegaConf.missing_keys(cfg.data.log)):
         raise UsageError(f"{missing[0]} has no value: give {missing[0]}=...")
     return cfg, found

@@ -164,7 +164,7 @@ def by_scene(values: Mapping[Any, Any], otherwise: Any = _NO_OTHER, *, _root_: D
     if found is _NO_OTHER:
         what = "none is named (data.log.scene or data.log.drive)" if key is None else f"{log[key]} is none of them"
         raise ValueError(
-            f"this protocol's windows of frames are those of {', '.join(map(str, values))}, and {what}: name one, or "
+            f"this protocol has windows of frames for {len(values)} scenes, and {what}: name one of conf/protocol, or "
             f"{_SAY_FRAMES}"
         )
     return found

@@ -41,7 +41,7 @@ class Conversion:
     """Those that an interrupted conversion had left."""
     bytes: int
     losses: tuple[str, ...]
-    doubts: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def partial_folder(folder: Path) -> Path:
@@ -70,9 +70,9 @@ def convert(
     folder = folder.resolve()
     check_free(folder)
     files = checked(list(writer.files(log)))
-    losses, doubts = writer.losses(log), writer.doubts(log)
+    losses, notes = writer.losses(log), writer.notes(log)
     partial = partial_folder(folder)
-    _take(partial, _description(log, source, writer, losses, doubts), files)
+    _take(partial, _description(log, source, writer, losses, notes), files)
     wanted = [file for file in files if not (partial / file.path).exists()]
     done = len(files) - len(wanted)
     try:
@@ -86,7 +86,7 @@ def convert(
         raise OSError(message + "give the same command to go on") from error
     size = sum((partial / file.path).stat().st_size for file in files)
     os.replace(partial, folder)
-    return Conversion(folder, len(files), len(files) - len(wanted), size, losses, doubts)
+    return Conversion(folder, len(files), len(files) - len(wanted), size, losses, notes)
 
 
 def check_free(folder: Path) -> None:
@@ -110,7 +110,7 @@ def checked(files: Sequence[LogFile]) -> Sequence[LogFile]:
 
 
 def _description(
-    log: DrivingLog, source: Source, writer: LogWriter, losses: tuple[str, ...], doubts: tuple[str, ...]
+    log: DrivingLog, source: Source, writer: LogWriter, losses: tuple[str, ...], notes: tuple[str, ...]
 ) -> bytes:
     content = {
         "format": FORMAT,
@@ -121,7 +121,7 @@ def _description(
         "frames": log.num_frames,
         "cameras": log.camera_names or tuple(map(str, range(log.num_cameras))),
         "losses": losses,
-        "doubts": doubts,
+        "notes": notes,
     }
     return json.dumps(content, indent=1, default=str).encode() + b"\n"
 

@@ -31,6 +31,6 @@ class LogWriter(ABC):
     def losses(self, log: DrivingLog) -> tuple[str, ...]:
         """What of this log the layout cannot hold, one sentence each, with numbers."""
 
-    def doubts(self, log: DrivingLog) -> tuple[str, ...]:
-        """Return what programs made for the layout will not take as it is written, one sentence each."""
+    def notes(self, log: DrivingLog) -> tuple[str, ...]:
+        """Return what was chosen, and what programs made for the layout will not take as it is, one sentence each."""
         return ()

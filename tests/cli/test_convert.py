@@ -31,7 +31,8 @@ def test_the_short_form_finds_the_reader_and_writes_drivestudios_layout(tmp_path
     place = lines.index(f"{out}: 43 files, 0.0 MB, 3 frames of 2 cameras")
     assert "43 of 43 files" in lines[place - 1]
     assert lines[place + 1] == "  lost or changed: images become JPEG of quality 95"
-    assert lines[place + 2].startswith("  doubt: DriveStudio takes sizes of images from datasets/dataset_meta.py")
+    assert lines[place + 2].startswith("  note: the flavor is waymo, which has cameras that are rigid on a vehicle; ")
+    assert lines[place + 3].startswith("  note: DriveStudio takes sizes of images from datasets/dataset_meta.py")
     assert (out / "ego_pose/002.txt").is_file()  # as the log, Waymo's flavor
     assert DriveStudioReader(out).check() == []
 
@@ -52,8 +53,8 @@ def test_the_part_the_layout_and_its_settings_are_chosen_by_keys(tmp_path, capsy
     assert line.endswith("knows in its flavor nuscenes (objects): Vehicle is vehicle.car (1)")
     printed = capsys.readouterr().out
     assert f"  lost or changed: {line}\n" in printed
-    assert all(f"  doubt: {doubt}\n" in printed for doubt in said["doubts"])
-    assert said["doubts"][-1].startswith("DriveStudio reads poses of cameras 0 too, which the log lacks")
+    assert all(f"  note: {note}\n" in printed for note in said["notes"])
+    assert said["notes"][-1].startswith("DriveStudio reads poses of cameras 0 too, which the log lacks")
 
 
 def test_a_street_is_made_and_converted(tmp_path, capsys):
@@ -80,7 +81,7 @@ def test_after_ctrl_c_the_same_command_goes_on(tmp_path, capsys, monkeypatch):
         "remove the folder\n"
     )
     assert converted(*words, "data.log.width=20") == 1
-    assert "differs in source, doubts: remove it, or name another place" in capsys.readouterr().err
+    assert "differs in source, notes: remove it, or name another place" in capsys.readouterr().err
     assert converted(*words, "data.log.cache_mb=9") == 0
     assert "files, 10 of them there already, " in capsys.readouterr().out
     assert not partial.exists()

@@ -9,6 +9,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.compose import CONF, composed, configuration
+from sparsestreet.cli.named_log import UsageError, configured_log
 
 PROTOCOLS = sorted(path.stem for path in (CONF / "protocol").glob("*.yaml"))
 OMNIRE = {
@@ -65,9 +66,9 @@ def test_drives_of_kitti_are_told_by_their_names():
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["protocol=omnire"], "none is named (data.log.scene or data.log.drive): name one"),
-        (["protocol=omnire", "data.log.scene=123_456"], "and 123456 is none of them: name one, or say"),
-        (["protocol=streetgs", "data.log.scene=7"], "those of 6, 26, 90, 105, 108, 134, 150, 181, and 7 is none"),
+        (["protocol=omnire"], "8 scenes, and none is named (data.log.scene or data.log.drive): name one"),
+        (["protocol=omnire", "data.log.scene=123_456"], "and 123456 is none of them: name one of conf"),
+        (["protocol=streetgs", "data.log.scene=7"], "for 8 scenes, and 7 is none of them: name one of conf/protocol"),
         (["protocol=drivestudio_kitti", "data.log.drive=2011_09_26_drive_0002"], "drive_0002 is none of them"),
         (
             ["+sweep=table5_ablation"],
@@ -99,3 +100,8 @@ SPLITS = {"omnire": (10, 10), "streetgs": (4, 4), "pvg": (4, 3), "neurad": (2, 1
 def test_what_is_held_out(name):
     split = composed([f"protocol={name}", "data.root=x"]).split
     assert (split.stride, split.offset) == SPLITS[name]
+
+
+def test_a_check_says_in_one_line_that_a_scene_has_no_window(tmp_path):
+    with pytest.raises(UsageError, match=r"^this protocol has windows of frames for 8 scenes, and none is named"):
+        configured_log(["data=waymo", "protocol=omnire"], tmp_path, no_log="", one_log="")

@@ -114,7 +114,7 @@ def interrupted(folder: Path) -> Path:
         (replace(SOURCE, data_hash="ffffffffffff"), Letters(), "differs in source"),
         (replace(SOURCE, reader={"width": 100}), Letters(), "differs in source"),
         (SOURCE, Letters(names=("a", "sub/b")), "differs in settings"),
-        (SOURCE, DriveStudioWriter(), "differs in layout, settings, losses, doubts"),
+        (SOURCE, DriveStudioWriter(), "differs in layout, settings, losses, notes"),
     ],
 )
 def test_a_partial_folder_of_something_else_is_left_as_it_is(source, writer, said, tmp_path):

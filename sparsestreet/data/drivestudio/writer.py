@@ -75,9 +75,11 @@ class DriveStudioWriter(LogWriter):
         pixels = () if self.jpeg_quality is None else (f"images become JPEG of quality {self.jpeg_quality}",)
         return (*losses_of(log, placed(log, self.flavor)), *pixels)
 
-    def doubts(self, log: DrivingLog) -> tuple[str, ...]:
+    def notes(self, log: DrivingLog) -> tuple[str, ...]:
         where = placed(log, self.flavor)
-        return unread_by_drivestudio(log, where, stand_ins(log, where))
+        what = "a pose for each image" if where.mounts is None else "cameras that are rigid on a vehicle"
+        chosen = f"the flavor is {where.flavor.name}, which has {what}; layout.flavor names another"
+        return (*([chosen] if self.flavor == "auto" else []), *unread_by_drivestudio(log, where, stand_ins(log, where)))
 
     def _image(self, log: DrivingLog, place: int) -> bytes:
         pixels = log.frames[place].image.numpy()

@@ -129,7 +129,7 @@ def written(log: DrivingLog, folder: Path, flavor: Any = "auto") -> tuple[str, .
     """What is said of it."""
     made = convert(log, Source(log.name, "0" * 12), DriveStudioWriter(jpeg_quality=None, flavor=flavor), folder)
     assert DriveStudioReader(folder).check() == []
-    return (*made.losses, *made.doubts)
+    return (*made.losses, *made.notes)
 
 
 def as_drivestudio(root: Path, flavor: str, cameras: tuple[int, ...]) -> tuple[dict[int, np.ndarray], list[np.ndarray]]:

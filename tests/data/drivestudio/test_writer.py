@@ -143,12 +143,13 @@ def test_a_flavor_is_one_of_those_that_are_written():
 
 
 def test_what_drivestudio_itself_needs_a_change_for_is_said(everything):
-    sizes, hood, stand_ins = LOSSLESS.doubts(everything)
+    sizes, hood, stand_ins = replace(LOSSLESS, flavor="nuscenes").notes(everything)
     assert sizes.endswith("camera 0 has 40x24, not 1600x900, 1 has 40x24, not 1600x900; write these sizes there")
     assert hood.endswith("in data/ego_masks/nuscenes: copy those of ego_masks")
     assert "cameras 2, 3, 4, 5 too" in stand_ins
     bare = replace(make_log(), tracks=())
-    (_, absent) = LOSSLESS.doubts(bare)
+    chosen, _, absent = LOSSLESS.notes(bare)
+    assert chosen == "the flavor is nuscenes, which has a pose for each image; layout.flavor names another"
     assert absent == (
         "DriveStudio asks for what is not there, unless data.pixel_source says so: lidar, without which it does not "
         "start, boxes (load_objects=false), bodies (load_smpl=false), human and vehicle masks (load_dynamic_mask=false)"

@@ -7,6 +7,7 @@ import torch
 
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
+from sparsestreet.data.drivestudio.classes import class_in
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
 from tests.data.same_log import check_same_masks, check_same_sweeps, check_same_track, check_same_views
@@ -32,7 +33,8 @@ def check_converted(log: DrivingLog, folder: Path) -> None:
         moved += int(((one.depth - other.depth).abs() > 1e-4).sum())
     # Returns are rounded to 4 micrometers: of 400,000 few lie so near to the border of a pixel.
     assert moved < 40
-    assert [track.class_name for track in found.tracks] == [track.class_name for track in log.tracks]
+    known = [class_in("nuscenes", track.class_name) for track in log.tracks]
+    assert [track.class_name for track in found.tracks] == known
     for one, other in zip(found.tracks, log.tracks, strict=True):
         check_same_track(found, one, log, other)
     assert found.radius == pytest.approx(log.radius, rel=1e-6)
