@@ -16,8 +16,8 @@ from sparsestreet.scene.nodes.tracked import Tracked
 Object = tuple[str, Tracked, int]
 """Name of a node, the node, and the number of one of its objects."""
 
-_LOW = 0.2
-"""Share of the opacity around a place that lies below the ground's height; on it stand and grow other things."""
+_LAYER = 0.3
+"""Meters of height that hold the ground; walls and trees spread over more, and so do guesses below it."""
 _ENOUGH = 5
 """Gaussians around a place to tell the ground's height by."""
 
@@ -118,7 +118,7 @@ def _added(scene: SceneGraph, objects: Mapping[str, Object], name: str, one: Add
 def ground_below(scene: SceneGraph, x: float, y: float) -> float | None:
     """Return the height of the ground at a place of the world, meters; None where nothing stands still within 8 m.
 
-    Below it is a fifth of the opacity of nodes without tracks, in the smallest circle that has enough of them.
+    It is that of the layer with most opacity of nodes without tracks, in the smallest circle that has enough of them.
     """
     rows = [node.rows for node in scene.nodes.values() if not isinstance(node, Tracked | EditedNode | AddedObject)]
     if not rows:
@@ -130,8 +130,11 @@ def ground_below(scene: SceneGraph, x: float, y: float) -> float | None:
         near = away < radius
         if int(near.sum()) >= _ENOUGH:
             heights, order = means[near, 2].sort()
-            below = weights[near][order].cumsum(0)
-            return float(heights[torch.searchsorted(below, _LOW * below[-1])])
+            below = torch.nn.functional.pad(weights[near][order].cumsum(0), (1, 0))
+            held = below[torch.searchsorted(heights, heights + _LAYER, right=True)] - below[:-1]
+            start = float(heights[held.argmax()])
+            layer = (heights >= start) & (heights <= start + _LAYER)
+            return float(heights[layer].median())
     return None
 
 
