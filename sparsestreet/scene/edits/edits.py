@@ -16,8 +16,8 @@ from sparsestreet.scene.nodes.tracked import Tracked
 Object = tuple[str, Tracked, int]
 """Name of a node, the node, and the number of one of its objects."""
 
-_LOW = 0.2
-"""Of the heights around a place: that of the ground, beside what grows or stands on it."""
+_LAYER = 0.3
+"""Meters of height that hold the ground; walls and trees spread over more, and so do guesses below it."""
 _ENOUGH = 5
 """Gaussians around a place to tell the ground's height by."""
 
@@ -118,17 +118,23 @@ def _added(scene: SceneGraph, objects: Mapping[str, Object], name: str, one: Add
 def ground_below(scene: SceneGraph, x: float, y: float) -> float | None:
     """Return the height of the ground at a place of the world, meters; None where nothing stands still within 8 m.
 
-    It is that of the lowest opaque Gaussians of nodes without tracks, in the smallest circle that has enough of them.
+    It is that of the layer with most opacity of nodes without tracks, in the smallest circle that has enough of them.
     """
     rows = [node.rows for node in scene.nodes.values() if not isinstance(node, Tracked | EditedNode | AddedObject)]
     if not rows:
         return None
-    means = torch.cat([one.means.detach()[one.opacity_logits.detach() > 0] for one in rows])
+    means = torch.cat([one.means.detach() for one in rows])
+    weights = torch.cat([one.opacity_logits.detach().flatten().sigmoid() for one in rows])
     away = torch.linalg.vector_norm(means[:, :2] - means.new_tensor([x, y]), dim=1)
     for radius in (1.0, 2.0, 4.0, 8.0):
-        near = means[away < radius, 2]
-        if len(near) >= _ENOUGH:
-            return float(near.quantile(_LOW))
+        near = away < radius
+        if int(near.sum()) >= _ENOUGH:
+            heights, order = means[near, 2].sort()
+            below = torch.nn.functional.pad(weights[near][order].cumsum(0), (1, 0))
+            held = below[torch.searchsorted(heights, heights + _LAYER, right=True)] - below[:-1]
+            start = float(heights[held.argmax()])
+            layer = (heights >= start) & (heights <= start + _LAYER)
+            return float(heights[layer].median())
     return None
 
 
