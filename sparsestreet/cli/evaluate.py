@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import data_of, this_command
+from sparsestreet.cli.checks import type_problem
 from sparsestreet.cli.device import device_of
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
@@ -71,6 +73,9 @@ def measure(options: Options) -> None:
     cfg, description = open_run_config(run, options.parts), RUN.read(run)
     if "evaluation" not in cfg:
         raise ValueError(f"{run} is of an earlier version, its configuration lacks 'evaluation': train it again")
+    for part in (cfg.evaluation, cfg.data.log):
+        if problem := type_problem(OmegaConf.to_container(part, resolve=True)):
+            raise ValueError(f"{run}: {problem}")
     # The milliseconds of a run are those of one number of threads, and never of more than there are cores.
     torch.set_num_threads(min(description.threads, this_machine().cores))
     extra = options.extra(made(cfg.evaluation))

@@ -41,10 +41,9 @@ def train(arguments: list[str]) -> int:
             parts, arguments = _without_parts(arguments)
             problem = flag_problem(arguments)
             if problem is None:
-                arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments), parts))
+                arguments, found = with_found_data(resumed_overrides(with_effect_keys(as_sweep(arguments)), parts))
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
-                arguments = as_sweep(arguments)
                 problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
                 arguments = _shown(arguments)
         except (FileNotFoundError, ValueError) as error:
