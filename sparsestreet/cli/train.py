@@ -24,6 +24,7 @@ from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
 from sparsestreet.cli.sweep import SweepFolder, as_sweep, note_of_sweep, run_job, sentence, sweep_problem, sweep_status
+from sparsestreet.naming import printable
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -49,7 +50,7 @@ def train(arguments: list[str]) -> int:
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
         if problem:
-            print(f"sparsestreet train: {problem}", file=sys.stderr)
+            print(printable(f"sparsestreet train: {problem}"), file=sys.stderr)
             return 2
         if note := note_of_sweep(arguments):
             print(f"sparsestreet train: {note}", file=sys.stderr)
