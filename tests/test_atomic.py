@@ -137,9 +137,7 @@ def test_nobody_waits_for_a_pipe_or_reads_a_device_without_end(name, kind, tmp_p
     else:
         with socket.socket(socket.AF_UNIX) as one, contextlib.chdir(tmp_path):
             one.bind(path.name)
-    with pytest.raises(
-        (OSError, ValueError), match="is a pipe, a socket or a device, and no file: put"
-    ):
+    with pytest.raises((OSError, ValueError), match="is a pipe, a socket or a device, and no file: put"):
         READERS[name](path)
 
 

@@ -14,6 +14,7 @@ from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
 from sparsestreet.cli.targets import made, open_run_config
 from sparsestreet.evaluation.extra import ExtraMetrics
+from sparsestreet.naming import printable
 from sparsestreet.records.provenance import this_machine
 from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.report.result import result_lines
@@ -90,7 +91,7 @@ def measure(options: Options) -> None:
         extra=extra,
         say=print,
     )
-    print("\n".join(result_lines(summary, run)))
+    print(printable("\n".join(result_lines(summary, run))))
 
 
 def extra_words(extra: ExtraMetrics) -> list[str]:
