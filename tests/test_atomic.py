@@ -13,6 +13,7 @@ from sparsestreet.records.strict_json import read_text
 from sparsestreet.safe_npz import read_npz
 from sparsestreet.safe_pickle import read_pickled
 from sparsestreet.safe_yaml import read_yaml
+from sparsestreet.training.callbacks.checkpoints import step_of
 
 
 def names(folder) -> list[str]:
@@ -118,6 +119,7 @@ READERS = {
     "ply": read_ply,
     "record": read_text,
     "table": all_rows,
+    "checkpoint": step_of,
     "colmap": lambda path: [*binary.camera_rows(path)],
     "colmap text": lambda path: [*text.camera_rows(path)],
 }

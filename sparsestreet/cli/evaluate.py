@@ -5,13 +5,16 @@ from pathlib import Path
 from typing import Literal
 
 import torch
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import data_of, this_command
+from sparsestreet.cli.checks import type_problem
 from sparsestreet.cli.device import device_of
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
 from sparsestreet.cli.targets import made, open_run_config
 from sparsestreet.evaluation.extra import ExtraMetrics
+from sparsestreet.naming import printable
 from sparsestreet.records.provenance import this_machine
 from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.report.result import result_lines
@@ -71,6 +74,9 @@ def measure(options: Options) -> None:
     cfg, description = open_run_config(run, options.parts), RUN.read(run)
     if "evaluation" not in cfg:
         raise ValueError(f"{run} is of an earlier version, its configuration lacks 'evaluation': train it again")
+    for part in (cfg.evaluation, cfg.data.log):
+        if problem := type_problem(OmegaConf.to_container(part, resolve=True)):
+            raise ValueError(f"{run}: {problem}")
     # The milliseconds of a run are those of one number of threads, and never of more than there are cores.
     torch.set_num_threads(min(description.threads, this_machine().cores))
     extra = options.extra(made(cfg.evaluation))
@@ -85,7 +91,7 @@ def measure(options: Options) -> None:
         extra=extra,
         say=print,
     )
-    print("\n".join(result_lines(summary, run)))
+    print(printable("\n".join(result_lines(summary, run))))
 
 
 def extra_words(extra: ExtraMetrics) -> list[str]:

@@ -10,7 +10,8 @@ SWEEPS = {"--multirun", "-m"}
 _OF_SHOWN = {"--resolve": "--cfg job --resolve", "--package": "--cfg job --package loss", "-p": "--cfg job -p loss"}
 """What these flags change is a printed configuration."""
 _OTHERS = "--help -h --hydra-help --version --run -r --shell-completion -sc --config-path -cp --config-name -cn"
-HYDRA = {*SHOWS, *SWEEPS, *_OF_SHOWN, *_OTHERS.split(), "--config-dir", "-cd", "--experimental-rerun"}
+HYDRA = {*SHOWS, *SWEEPS, *_OF_SHOWN, *_OTHERS.split(), "--config-dir", "-cd"}
+"""Without ``--experimental-rerun``, which opens a pickle of a run and runs whatever it holds."""
 
 
 def flags_of(arguments: Iterable[str]) -> set[str]:

@@ -14,6 +14,7 @@ from yaml import YAMLError
 from sparsestreet.atomic import atomic_file
 from sparsestreet.cli.compose import load_run_config, resolved
 from sparsestreet.cli.resume import has_checkpoint, run_of
+from sparsestreet.cli.targets import leaves
 from sparsestreet.records.configuration import Configuration, config_hash, flat_config, only
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.file import check_links
@@ -147,10 +148,20 @@ def take_folder(cfg: DictConfig, out: Path, goes_on: bool) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     folder = out / CONFIGURATION
     folder.mkdir(parents=True, exist_ok=True)
-    said = {"overrides": HydraConfig.get().overrides.task, "hydra": HydraConfig.instance().cfg, "config": cfg}
+    config = _without_environment(cfg)
+    said = {"overrides": HydraConfig.get().overrides.task, "hydra": HydraConfig.instance().cfg, "config": config}
     for name, part in said.items():
         with atomic_file(folder / f"{name}.yaml") as temporary:
             OmegaConf.save(part, temporary)
+
+
+def _without_environment(cfg: DictConfig) -> DictConfig:
+    """What a configuration takes from the environment, as values: of a run that is opened nothing may ask for it."""
+    known = cfg.copy()
+    for place, value in leaves(OmegaConf.to_container(cfg)):
+        if isinstance(value, str) and "${oc.env:" in value:
+            OmegaConf.update(known, ".".join(place), OmegaConf.select(cfg, ".".join(place)))
+    return known
 
 
 def leave_folder(out: Path, log: str) -> None:

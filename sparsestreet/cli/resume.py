@@ -15,7 +15,7 @@ from sparsestreet.cli.targets import check_modules, check_places, check_received
 from sparsestreet.records.branch_of import moment_of
 from sparsestreet.safe_yaml import read_yaml
 
-_PASSING = ("overrides", "runtime", "sweeper", "sweep", "job")
+_PASSING = {"overrides", "runtime", "sweeper", "sweep"}
 """Keys of hydra's own configuration that follow from the words, or act in sweeps alone."""
 
 
@@ -70,7 +70,9 @@ def _check_words(received: list[str], typed: list[str], source: Path, parts: Seq
         return  # nothing is made of words that do not compose; ``override_problem`` says why
     plain = _own([*typed])
     hydra, own = merged.pop("hydra"), plain.pop("hydra")
-    if changed := [key for key in hydra if key not in _PASSING and hydra[key] != own.get(key)]:
+    for one in (hydra, own):
+        one["job"].pop("override_dirname", None)  # which follows from the words
+    if changed := [key for key in hydra.keys() - _PASSING if hydra[key] != own.get(key)]:
         raise ValueError(f"{source} changes hydra.{changed[0]}, which a run that was received does not choose")
     said = frozenset((place, repr(value)) for place, value in leaves(plain))
     check_received(merged, source, parts, said)

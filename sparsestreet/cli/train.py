@@ -35,6 +35,7 @@ from sparsestreet.cli.sweep import (
     with_fixed_keys,
 )
 from sparsestreet.demand import as_demand
+from sparsestreet.naming import printable
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -52,18 +53,17 @@ def train(arguments: list[str]) -> int:
             parts, arguments = _without_parts(arguments)
             problem = flag_problem(arguments)
             if problem is None:
-                arguments = as_typed(arguments)
+                arguments = as_sweep(as_typed(arguments))
                 arguments, found = with_found_data(resumed_overrides(with_effect_keys(arguments), parts))
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
-                arguments = as_sweep(arguments)
                 problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
                 problem = problem or job_problem(arguments)
                 arguments = _shown(with_fixed_keys(arguments))
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
         if problem:
-            print(f"sparsestreet train: {problem}", file=sys.stderr)
+            print(printable(f"sparsestreet train: {problem}"), file=sys.stderr)
             return 2
         if note := note_of_sweep(arguments):
             print(f"sparsestreet train: {note}", file=sys.stderr)

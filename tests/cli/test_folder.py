@@ -218,13 +218,14 @@ def within_hydra(monkeypatch):
 
 
 @pytest.mark.usefixtures("within_hydra")
-def test_nothing_of_a_replaced_run_stays_beside_the_new_one(tmp_path):
+def test_nothing_of_a_replaced_run_stays_beside_the_new_one(tmp_path, monkeypatch):
     out = a_run(tmp_path / "run")
     for name in ("records", "pictures", "curves", "predictions"):
         (out / name).mkdir(exist_ok=True)
         (out / name / "old").touch()
     (out / "notes.txt").touch()
-    take_folder(composed(["overwrite=true", "seed=1"]), out, goes_on=False)
+    monkeypatch.setenv("SEED_OF_RUN", "1")
+    take_folder(composed(["overwrite=true", "seed='${oc.decode:${oc.env:SEED_OF_RUN}}'"]), out, goes_on=False)
     assert not [name for name in OF_A_RUN if (out / name).exists()]
     assert (out / "notes.txt").is_file()
     config, hydra, overrides = (

@@ -46,7 +46,7 @@ def test_names_that_a_terminal_would_obey_are_written_out(tmp_path, capsys):
     assert objects([str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert r"\x1b]0;owned\x07\ncar\u202e" in said
-    assert sum(line.startswith("\\x1b") for line in said.splitlines()) == 2  # an object a line
+    assert sum("owned" in line for line in said.split("\n")) == 2
     (tmp_path / "edits.yaml").write_text("remove: ['\\e[2J']\n".replace("'", '"'))
     assert render([str(tmp_path), str(tmp_path / "a.mp4"), f"edits={tmp_path / 'edits.yaml'}"]) == 1
     captured = capsys.readouterr()

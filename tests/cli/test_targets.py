@@ -1,6 +1,5 @@
 """A run's folder may come from anybody: whatever it names, only what conf/ names is made, or what the user trusts."""
 
-import itertools
 import re
 import sys
 from collections.abc import Callable
@@ -114,8 +113,8 @@ def test_nothing_that_a_received_run_names_is_made_by_any_command(tmp_path, monk
     monkeypatch.setattr("sparsestreet.scene.storage.load_scene", lambda *given: pytest.fail("it was opened"))
     monkeypatch.setattr("sparsestreet.serving.scenes.Scenes.rig", lambda *given: SimpleNamespace(cameras=()))
     mark = tmp_path / "it_ran"
-    cases = itertools.product(attacks(str(mark)), WRAPPED)
-    for number, (part, wrap) in enumerate(cases):
+    for number, part in enumerate(attacks(str(mark)) * 3):
+        wrap = WRAPPED[(number + number // len(WRAPPED)) % len(WRAPPED)]
         run = run_with(tmp_path / "run", PLACES[number % len(PLACES)], wrap(part))
         commands = opened_by(run, tmp_path)
         try:
@@ -249,15 +248,32 @@ def test_words_of_a_received_run_choose_no_code_and_no_place(word, said, tmp_pat
     assert "\n" not in str(told.value)
 
 
-def test_a_file_outside_of_conf_reaches_hydra_no_more_than_a_word(tmp_path):
+@pytest.mark.parametrize(
+    ("package", "content", "key"),
+    [
+        ("hydra.job_logging.handlers.file", "{class: os.system, command: touch here}", "job_logging"),
+        ("hydra.callbacks.mine", "{_target_: os.mkdir, path: here}", "callbacks"),
+        ("hydra.job", "{name: ../../elsewhere}", "job"),
+        ("hydra", "{mode: MULTIRUN}", "mode"),
+    ],
+)
+def test_a_file_outside_of_conf_reaches_hydra_no_more_than_a_word(package, content, key, tmp_path):
     """A group's option may lead out of conf/."""
-    (tmp_path / "evil.yaml").write_text(
-        "# @package hydra.job_logging.handlers.file\nclass: os.system\ncommand: 'touch here'\n"
-    )
-    up = "../" * len(CONF.parts)
+    (tmp_path / "evil.yaml").write_text(f"# @package {package}\n{content}\n")
+    up = "../" * (len(CONF.parts) + 3)
     run = received(tmp_path / "run", f"experiment={up}{tmp_path.relative_to('/')}/evil")
-    with pytest.raises(ValueError, match=r"overrides\.yaml changes hydra\.job_logging"):
+    with pytest.raises(ValueError, match=rf"overrides\.yaml changes hydra\.{key}, which a run that was received does"):
         resumed_overrides([f"resume={run}"])
+
+
+def test_words_of_a_received_run_begin_no_sweep(tmp_path, monkeypatch):
+    """The values that a sweep varies are composed job by job, where nobody looks any more."""
+    run, asked = received(tmp_path / "run", "+sweep=tiny"), []
+    monkeypatch.setattr("sparsestreet.cli.train.override_problem", lambda words: asked.append(words) or "enough")
+    assert train([f"resume={run}"]) == 2
+    assert asked == [["+sweep=tiny", f"resume={run}", f"out={run}"]]
+    assert train([f"resume={run}", "+sweep=tiny"]) == 2
+    assert len(asked) == 1
 
 
 def test_what_the_user_says_now_is_the_users(tmp_path, capsys):

@@ -19,6 +19,7 @@ from sparsestreet.cli.train import train
         (["data=drivestudio"], "data.root has no value"),
         (["schedule.max_steps=abc"], "must be a whole number, 1 or more, got 'abc'"),
         (["resume=/nowhere/at/all"], "there is nothing"),
+        (["--experimental-rerun=run/.hydra/config.pickle"], "--experimental-rerun is no flag"),
         (
             ["++loss.mine._target_=mypaper.Loss"],
             "loss.mine._target_: there is no module mypaper; is its folder in PYTHONPATH?",

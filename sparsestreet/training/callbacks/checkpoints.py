@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.atomic import atomic_file
+from sparsestreet.atomic import atomic_file, check_regular
 from sparsestreet.phases import stage
 from sparsestreet.ranks import LostProcessError
 from sparsestreet.records.branch_of import kept_before
@@ -122,6 +122,7 @@ class Checkpoints(Callback):
 def step_of(checkpoint: Path) -> int:
     """After how many steps it was written. Raises ValueError for a file that is no checkpoint of plain values, or in
     which a bit is not what was written: torch reads tensors without a look at their checksums."""
+    check_regular(checkpoint)
     try:
         _check_sums(checkpoint)
         return int(torch.load(checkpoint, map_location="cpu", weights_only=True)["global_step"])

@@ -293,6 +293,16 @@ def test_frames_of_a_request_are_turned_along_the_shorter_arc():
     assert Given(placed(1.0)).frame(0.3, lambda time: np.eye(4))[0, 3] == 1
 
 
+def test_a_name_of_megabytes_is_compared_by_its_beginning(scene, monkeypatch):
+    """difflib would take seconds for it, and a request may hold one."""
+    compared: list[int] = []
+    monkeypatch.setattr("difflib.get_close_matches", lambda name, *_, **__: compared.append(len(name)) or [])
+    with pytest.raises(ValueError, match=r"no object 'xxx.*xxx\.\.\.': the nearest names are ") as told:
+        edited(scene, Edits({"x" * (16 << 20): REMOVED}))
+    assert compared == [100]
+    assert len(str(told.value)) < 300
+
+
 def test_wrong_names_are_named(scene):
     with pytest.raises(ValueError, match=r"no object 'tram 13': the nearest names are tram 12"):
         edited(scene, Edits({"tram 13": REMOVED}))
