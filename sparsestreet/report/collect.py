@@ -1,13 +1,12 @@
 """Finds the records of finished runs, and writes what of them a repository can keep."""
 
-import json
 import re
 from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.records.same_as import SAME_AS
-from sparsestreet.records.strict_json import significant, write_atomically
+from sparsestreet.records.strict_json import json_line, write_atomically
 from sparsestreet.records.summary import SUMMARY, RunSummary
 
 
@@ -53,14 +52,15 @@ def keep_records(records: Sequence[RunRecord], path: Path) -> None:
 
     Raises OSError where the file cannot be written.
     """
-    lines = [json.dumps(_kept(record.summary), sort_keys=True) for record in records]
+    lines = [json_line(_kept(record.summary), str(record.folder)) for record in records]
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, "".join(f"{line}\n" for line in lines))
 
 
 def _kept(summary: RunSummary) -> dict[str, object]:
     run = summary.run
     means = {
-        split: {name: significant(one.mean, name) for name, one in metrics.items() if one.mean is not None}
+        split: {name: one.mean for name, one in metrics.items() if one.mean is not None}
         for split, metrics in summary.quality.items()
     }
     return {
@@ -69,7 +69,7 @@ def _kept(summary: RunSummary) -> dict[str, object]:
         "data_hash": run.data_hash,
         # A repository is no place for the folders of a machine.
         "command": re.sub(r"(?<![^=\s,\[])(?:~|\.{0,2})/[^\s,\]]*/", "", run.command),
-        "source": vars(run.source),
+        "source": run.source,
         "machine": {**vars(run.machine), "device": run.device, "threads": run.threads},
         "sizes": summary.resolutions,
         "images": summary.images,
@@ -79,7 +79,7 @@ def _kept(summary: RunSummary) -> dict[str, object]:
         "caps": run.caps,
         "bytes": summary.bytes_by_part,
         "bytes_total": summary.bytes_total,
-        "frame_ms": significant(summary.latency.p50, "frame_ms"),
+        "frame_ms": summary.latency.p50,
         "quiet": summary.latency.noise.quiet and (run.noise is None or run.noise.quiet),
         "training_seconds": run.training_seconds,
     }

@@ -48,7 +48,7 @@ def test_records_of_runs_are_kept_in_a_line_each(tmp_path, capsys):
     away = "sparsestreet train data.root=/home/me/drive out=~/x/run seed=3 data.a=[/k/l,/m/n] b=1/2"
     SUMMARY.write(tmp_path / "a/b", make_summary("plain", seed=3, training_psnr=28.25, milliseconds=41.5, command=away))
     SUMMARY.write(tmp_path / "c", make_summary("ours", gaussians={"background": 7}, psnr=24.125, vehicle_psnr=None))
-    kept = tmp_path / "kept.jsonl"
+    kept = tmp_path / "new/kept.jsonl"
     assert report([str(tmp_path), f"records={kept}"]) == 0
     assert f"{kept}: a line for each run" in capsys.readouterr().out
     assert len(kept.read_bytes()) < 2 * 4096

@@ -24,6 +24,7 @@ class MaskTraining(Callback):
 
     def __init__(self, remove_in: Interval) -> None:
         self.remove_in = remove_in
+        self._said: set[str] = set()
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: object, batch: object, batch_idx: int
@@ -46,11 +47,14 @@ class MaskTraining(Callback):
         selection = mask.keep(node.rows)
         firings = int(mask.floor_firings)
         if selection.floor_hit or firings:
-            log.info(
+            # A node that is below its floor holds it at every removal: the first one is news.
+            log.log(
+                logging.DEBUG if name in self._said else logging.INFO,
                 "step %d: the floor of %d Gaussians (K_min) of node %r held in %d steps since the last removal: "
                 "masks of the best rows stay open",
                 trainer.global_step, node.settings.min_gaussians, name, firings,
             )  # fmt: skip
             mask.floor_firings = 0
+            self._said.add(name)
         if selection.removed:
             resize_rows(trainer, system, name, selection.plan(), REASON)

@@ -111,6 +111,9 @@ def test_the_floor_keeps_the_best_rows_and_is_counted_and_logged(caplog):
     assert node.mask.floor_firings == 0
     (message,) = caplog.messages
     assert message.startswith("step 20: the floor of 5 Gaussians (K_min) of node 'background' held in 3 steps")
+    with caplog.at_level(logging.INFO):
+        trainer.train(20, frame_at())
+    assert caplog.messages == [message], "a node below its floor holds it at each removal: that is said once"
 
 
 def test_a_floor_that_held_only_before_is_logged_and_one_that_never_did_is_not(caplog):
