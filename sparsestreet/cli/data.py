@@ -1,15 +1,18 @@
 """``sparsestreet data``: logs are checked, converted and made."""
 
 import sys
+from functools import partial
 from pathlib import Path
 
 from sparsestreet.cli.convert import convert
 from sparsestreet.cli.named_log import UsageError, compose_data, configured_log, reader_of
 from sparsestreet.data.check import report_check
+from sparsestreet.data.log import split
+from sparsestreet.data.notes import counted
 
 USAGE = """\
 sparsestreet data check DIR [data=nuscenes data.log.scene=scene-0061 data.log.last_frame=50 ...]
-    print everything that is wrong with a log, or with the part that is chosen (exit status 1), or its summary;
+    print what is wrong with a log, or with the part that is chosen (exit status 1), or its summary;
     without data=... the folder's files tell which reader is asked
 sparsestreet data convert from=DIR to=DIR [data=... layout=drivestudio layout.jpeg_quality=95 ...]
     write a log in the layout of a data set; the same command goes on where it was interrupted
@@ -49,7 +52,9 @@ def _check(arguments: list[str]) -> int:
     cfg, found = configured_log(overrides, Path(folders[0]) if folders else None, no_log=_NO_LOG, one_log=one_log)
     if found:
         print(found)
-    return report_check(reader_of(cfg))
+    return report_check(
+        reader_of(cfg), split_of=partial(split, **{key: cfg.split[key] for key in ("stride", "offset", "cameras")})
+    )
 
 
 def _make(overrides: list[str]) -> int:
@@ -58,5 +63,5 @@ def _make(overrides: list[str]) -> int:
         raise UsageError("only data=synthetic can be made; a recorded drive is read as it is")
     reader = reader_of(cfg)
     log = reader.read()
-    print(f"{reader.folder}: {log.num_frames} frames of {log.num_cameras} cameras")
+    print(f"{reader.folder}: {counted(log.num_frames, 'frame')} of {counted(log.num_cameras, 'camera')}")
     return 0

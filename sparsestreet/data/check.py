@@ -1,7 +1,6 @@
 """What `sparsestreet data check` prints: every problem of a log, or what a sound one holds."""
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Callable
 
 from rich.console import Console
 from rich.markup import escape
@@ -10,48 +9,74 @@ from rich.table import Table
 from sparsestreet.data.doubts import doubts
 from sparsestreet.data.ego import check_used
 from sparsestreet.data.hood import find_hoods, with_hoods
-from sparsestreet.data.log import DrivingLog
-from sparsestreet.data.problems import Problem
+from sparsestreet.data.log import DrivingLog, Split, split
+from sparsestreet.data.notes import counted
 from sparsestreet.data.reader import LogReader
 from sparsestreet.geometry.displacement import displacement
 
 
-def report_check(reader: LogReader, console: Console | None = None) -> int:
-    """Print all problems of what the reader would read, or a summary of it; 1 where there are problems, else 0."""
+def report_check(
+    reader: LogReader, console: Console | None = None, split_of: Callable[[DrivingLog], Split] = split
+) -> int:
+    """Print the problems of what the reader would read, a line each, or a summary; 1 where there are problems, else 0.
+
+    ``split_of``: what a training would hold out; raises ValueError where it cannot.
+    """
     console = Console() if console is None else console
     problems = reader.check()
     if problems:
-        console.print(_problem_table(reader.folder, problems))
-        console.print(f"[bold red]{len(problems)} to repair[/] in {escape(str(reader.folder))}")
+        for problem in problems:
+            inside = problem.path.is_relative_to(reader.folder)
+            path = problem.path.relative_to(reader.folder) if inside else problem.path
+            _line(console, "bold", f"{path}:", f"{problem.message}; {problem.remedy}")
+        _line(
+            console,
+            "bold red",
+            f"{len(problems)} to repair",
+            f"in {reader.folder}; repair these first: more may be found then",
+        )
         return 1
-    log = reader.read()
+    return _report_log(reader.read(), reader, console, split_of)
+
+
+def _report_log(log: DrivingLog, reader: LogReader, console: Console, split_of: Callable[[DrivingLog], Split]) -> int:
     try:
         check_used(log.frames, log.name)
     except ValueError as error:
-        console.print(f"[bold red]nothing to train on[/]: {escape(str(error))}")
+        _line(console, "bold red", "nothing to train on:", str(error))
         return 1
     console.print(_summary(log))
     console.print(_camera_table(log))
     if log.tracks:
         console.print(_track_table(log))
     for note in log.notes:
-        console.print(f"[yellow]note[/] {escape(note)}")
+        _line(console, "yellow", "note", note)
     for doubt in doubts(log, with_hoods(log.frames, find_hoods(log.frames, log.sweeps))):
-        console.print(f"[bold yellow]doubt[/] {escape(doubt)}")
-    console.print(f"[bold green]ready to train[/]: {escape(str(reader.folder))}")
+        _line(console, "bold yellow", "doubt", doubt)
+    try:
+        split_of(log)
+    except ValueError as error:
+        _line(console, "bold red", "not ready to train:", str(error))
+        return 1
+    _line(console, "bold green", "ready to train:", str(reader.folder))
     return 0
 
 
-def _problem_table(root: Path, problems: Sequence[Problem]) -> Table:
-    table = Table("file", "problem", "remedy", title=f"Problems of {escape(str(root))}", show_lines=True)
-    for problem in problems:
-        path = problem.path.relative_to(root) if problem.path.is_relative_to(root) else problem.path
-        table.add_row(*map(escape, (str(path), problem.message, problem.remedy)))
+def _line(console: Console, style: str, word: str, text: str) -> None:
+    """One line, however narrow the console: whoever reads it may be a program."""
+    console.print(f"[{style}]{escape(word)}[/] {escape(text)}", soft_wrap=True)
+
+
+def _table(*headers: str, title: str) -> Table:
+    """Whose columns break names rather than cut them."""
+    table = Table(*headers, title=title)
+    for column in table.columns:
+        column.overflow = "fold"
     return table
 
 
 def _summary(log: DrivingLog) -> Table:
-    table = Table("log", escape(log.name), title="What the log holds")
+    table = _table("log", escape(log.name), title="What the log holds")
     counts = [(len(sweep.points), int(sweep.colored.sum())) for sweep in log.sweeps.gray()]
     points, colored = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     table.add_row("frames x cameras", f"{log.num_frames} x {log.num_cameras}")
@@ -59,7 +84,8 @@ def _summary(log: DrivingLog) -> Table:
     if log.stamps:
         table.add_row("stamps", _stamps(log))
     table.add_row(
-        "lidar", f"{points:,} points in {len(counts)} sweeps ({colored:,} seen by a camera)" if counts else "none"
+        "lidar",
+        f"{points:,} points in {counted(len(counts), 'sweep')} ({colored:,} seen by a camera)" if counts else "none",
     )
     if log.sparse_points is not None:
         table.add_row("sparse points", f"{len(log.sparse_points()):,}")
@@ -81,7 +107,7 @@ def _stamps(log: DrivingLog) -> str:
 
 def _camera_table(log: DrivingLog) -> Table:
     """Sizes, lenses, shutters, and the masks of each camera's first image."""
-    table = Table("camera", "images", "size", "lens", "shutter", "masks", title="Cameras")
+    table = _table("camera", "images", "size", "lens", "shutter", "masks", title="Cameras")
     for index in range(log.num_cameras):
         frames = log.frames.where(lambda view, index=index: view.camera_index == index)
         if not frames:
@@ -97,7 +123,7 @@ def _camera_table(log: DrivingLog) -> Table:
 
 
 def _track_table(log: DrivingLog) -> Table:
-    table = Table("class", "objects", "boxes", "largest displacement (m)", title="Objects")
+    table = _table("class", "objects", "boxes", "largest displacement (m)", title="Objects")
     for name in sorted({track.class_name for track in log.tracks}):
         tracks = [track for track in log.tracks if track.class_name == name]
         boxes = sum(len(track.frames) for track in tracks)

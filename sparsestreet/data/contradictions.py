@@ -26,7 +26,7 @@ _SPEED = 100.0
 _ACCELERATION = 30.0
 """Meters per second squared; three times what tires hold."""
 _OUTLYING = 10.0
-"""Times the median acceleration of a camera: poses that tremble have no single one that is wrong."""
+"""Times the lower quartile of a camera's accelerations: poses that tremble have no single one that is wrong."""
 _COARSEST_EXACT = 2.0**-10
 """Meters: float32's grid 8 to 16 km from the origin. A finer one cannot be seen."""
 _OFF_GRID = 0.05
@@ -159,7 +159,7 @@ def _jumps(cameras: Sequence[tuple[str, Frames]]) -> Iterator[str]:
                 f"the poses of camera {name} tremble: half of its accelerations exceed {usual:.0f} m/s^2; perhaps they "
                 "were stored in float32 at large coordinates: write them in float64, or take an offset off before"
             )
-        elif worst > max(_ACCELERATION, _OUTLYING * usual):
+        elif worst > max(_ACCELERATION, _OUTLYING * float(changes.quantile(0.25))):
             # A wrong frame changes the steps on both of its sides, and with them three accelerations.
             three = torch.nn.functional.pad(changes, (1, 1)).unfold(0, 3, 1).sum(1)
             yield (
@@ -283,7 +283,9 @@ def _stray(centers: Float64[Tensor, "f 3"], steps: Float64[Tensor, " s"]) -> tup
     before, after = steps[:-1], steps[1:]
     part = (before / (before + after))[:, None]
     beside = (centers[1:-1] - torch.lerp(centers[:-2], centers[2:], part)).norm(dim=1)
-    allowed = (_ACCELERATION / 2 * before * after).clamp(min=max(_STRAY, _OUTLYING * float(beside.quantile(0.5))))
+    # One wrong box is beside its line and so are both neighbors: of few boxes that is half of them.
+    usual = float(beside.quantile(0.25)) if len(beside) > 3 else 0.0
+    allowed = (_ACCELERATION / 2 * before * after).clamp(min=max(_STRAY, _OUTLYING * usual))
     worst = int((beside - allowed).argmax())
     return (worst + 1, float(beside[worst])) if beside[worst] > allowed[worst] else None
 

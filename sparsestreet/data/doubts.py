@@ -11,6 +11,7 @@ from sparsestreet.data.ego import used_share
 from sparsestreet.data.followed import FEWEST, followed
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.notes import counted
 from sparsestreet.types import Track
 
 MOST_FRAMES = 36
@@ -99,14 +100,14 @@ def _shared_boxes(tracks: Sequence[Track]) -> Iterator[str]:
         if 2 * count >= len(tracks[small].frames):
             yield (
                 f"objects {tracks[large].name} and {tracks[small].name} ({tracks[small].class_name}) have one box in "
-                f"{count} frames: remove one of them, or both are drawn"
+                f"{counted(count, 'frame')}: remove one of them, or both are drawn"
             )
     for (large, small), count in inside.items():
         if 2 * count >= len(tracks[small].frames):
             yield (
                 f"object {tracks[small].name} ({tracks[small].class_name}) is inside the box of {tracks[large].name} "
-                f"({tracks[large].class_name}) in {count} frames: both start from what is seen there; remove the one "
-                "that needs no motion of its own"
+                f"({tracks[large].class_name}) in {counted(count, 'frame')}: both start from what is seen there; "
+                "remove the one that needs no motion of its own"
             )
 
 

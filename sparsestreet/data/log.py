@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sparsestreet.data.hood import Hood
 from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.notes import counted
 from sparsestreet.data.tracks import repeated
 from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.types import Frame, SparsePoints, Track, View
@@ -236,18 +237,21 @@ def split(log: DrivingLog, *, stride: int = 10, offset: int = 5, cameras: Sequen
         return Split(log.frames, Frames.of(()))
     if not 0 <= offset <= stride:
         raise ValueError(
-            f"a split needs 0 <= offset <= stride, got offset {offset} and stride {stride}: offset is the first frame "
-            "that is held out, and the next one comes stride frames later"
+            f"a split needs 0 <= offset <= stride, got split.offset {offset} and split.stride {stride}: offset is the "
+            "first frame that is held out, and the next one comes stride frames later"
         )
     instants = frozenset(range(offset, log.num_frames, stride))
     held_out = log.frames.where(lambda view: view.frame_index in instants)
     train = log.frames.where(lambda view: view.frame_index not in instants)
     if not train:
-        raise ValueError(f"stride {stride} holds out all {log.num_frames} frames of {log.name!r}: take a larger stride")
+        raise ValueError(
+            f"split.stride {stride} holds out all of {counted(log.num_frames, 'frame')} of {log.name!r}: take a larger "
+            "one, or say split.stride=0 to train on every frame"
+        )
     if not held_out:
         raise ValueError(
-            f"offset {offset} lies behind the {log.num_frames} frames of {log.name!r}, so nothing would be held out: "
-            "lower the offset, or say stride=0 to train on every frame"
+            f"split.offset {offset} lies behind the {counted(log.num_frames, 'frame')} of {log.name!r}, so nothing "
+            "would be held out: lower split.offset, or say split.stride=0 to train on every frame"
         )
     return Split(train, held_out)
 

@@ -10,6 +10,15 @@ _ABSENT = {
 }
 
 
+def counted(number: int, noun: str) -> str:
+    """Return both, the noun in the plural unless there is one.
+
+    >>> counted(1, "sweep"), counted(2, "sweep")
+    ('1 sweep', '2 sweeps')
+    """
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def absence_notes(*, sky: bool, human: bool, vehicle: bool, lidar: bool, boxes: bool, clock: bool) -> tuple[str, ...]:
     """A sentence for each part that a log does not have, of which a reader says for each whether it is there."""
     present = {"sky": sky, "human": human, "vehicle": vehicle, "lidar": lidar, "boxes": boxes, "clock": clock}

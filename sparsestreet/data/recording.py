@@ -242,7 +242,12 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
         carried_without=folder.holding_out,
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
         vehicle=_vehicle(recording.vehicle, origin),
-        notes=(*_absent(recording), *(camera.note for camera in recording.rig if camera.note), *recording.notes),
+        notes=(
+            *_absent(recording),
+            *(camera.note for camera in recording.rig if camera.note),
+            *_size_notes(recording.boxes or ()),
+            *recording.notes,
+        ),
     )
 
 
@@ -354,6 +359,21 @@ def _sparse_points(recording: Recording, origin: Float64[Tensor, "3"]) -> Sparse
     if len(colors) and bool((colors == 0.5).all()):
         notes.append(f"the points{where} have no colors that are known (red, green, blue, or f_dc_0): they are gray")
     return SparsePoints(places[finite], colors[finite], tuple(notes))
+
+
+def _size_notes(objects: Sequence[Boxes]) -> list[str]:
+    """One sentence for objects whose boxes differ in size by more than a tenth, and by more than 0.1 m."""
+    found = []
+    for each in objects:
+        least, most = each.sizes.min(0), each.sizes.max(0)
+        if ((most > 1.1 * least) & (most - least > 0.1)).any():
+            side = int((most / least).argmax())
+            name = ("length", "width", "height")[side]
+            found.append(f"{each.name}, {name} {least[side]:.2f} to {most[side]:.2f} m")
+    if not found:
+        return []
+    more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+    return [f"the boxes of some objects differ in size, their mean is taken: {'; '.join(found[:3])}{more}"]
 
 
 def _absent(recording: Recording) -> tuple[str, ...]:

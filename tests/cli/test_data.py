@@ -27,6 +27,10 @@ SMALL = [
 ]  # fmt: skip
 
 
+SPLIT = "split.offset=1"
+"""Of so few frames the usual split would hold out none."""
+
+
 @pytest.fixture
 def lens(tmp_path) -> Path:
     """A log of 12 frames whose second camera has a lens without inverse, and whose frame 7 lacks its points."""
@@ -38,13 +42,13 @@ def lens(tmp_path) -> Path:
 
 @pytest.mark.parametrize("say", [lambda root: f"{root}", lambda root: f"data.root={root}"])
 def test_a_folder_is_checked_as_it_is_or_by_its_key(say, tmp_path, capsys):
-    assert data(["check", say(make_nuscenes(tmp_path))]) == 0
+    assert data(["check", say(make_nuscenes(tmp_path)), SPLIT]) == 0
     assert "ready to train" in capsys.readouterr().out
 
 
 def test_a_folder_may_be_named_as_it_likes(tmp_path, capsys):
     odd = tmp_path / "a, b {c} $d 'e'"
-    assert data(["check", str(make_nuscenes(odd))]) == 0
+    assert data(["check", str(make_nuscenes(odd)), SPLIT]) == 0
     assert "ready to train" in capsys.readouterr().out
 
 
@@ -59,7 +63,7 @@ def test_a_folder_may_be_named_as_it_likes(tmp_path, capsys):
     ],
 )
 def test_only_what_would_be_read_is_checked(choice, count, lens, capsys):
-    assert data(["check", str(lens), *choice]) == (1 if count else 0)
+    assert data(["check", str(lens), *choice, SPLIT]) == (1 if count else 0)
     printed = capsys.readouterr().out
     assert (f"{count} to repair" if count else "ready to train") in printed
     if "data.log.first_frame=8" in choice:
@@ -69,12 +73,12 @@ def test_only_what_would_be_read_is_checked(choice, count, lens, capsys):
 def test_the_check_says_what_a_lens_does(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
     write_lines(make_waymo(tmp_path) / "intrinsics/1.txt", [40.0, 40, 20, 12, 0.25, 0, 0, 0, 0])
-    assert data(["check", str(tmp_path)]) == 0
+    assert data(["check", str(tmp_path), SPLIT]) == 0
     assert "camera 1: its lens moves pixels by up to" in capsys.readouterr().out
 
 
 def test_the_size_is_the_one_that_would_be_read(tmp_path, capsys):
-    assert data(["check", str(make_nuscenes(tmp_path)), "data.log.width=20"]) == 0
+    assert data(["check", str(make_nuscenes(tmp_path)), "data.log.width=20", SPLIT]) == 0
     assert "20x12" in capsys.readouterr().out
 
 
@@ -107,7 +111,7 @@ def test_streets_of_other_settings_lie_beside_each_other(tmp_path, capsys):
         for choice in ([], ["data.log.settings.ego_speed=5.0"], []):
             assert data(["make", *SMALL, f"data.log.parent={tmp_path}", *choice]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(": ")[2] for line in lines] == ["2 frames of 1 cameras"] * 3
+    assert [line.partition(": ")[2] for line in lines] == ["2 frames of 1 camera"] * 3
     folders = [line.partition(":")[0] for line in lines]
     assert folders[0] == folders[2]
     assert {Path(folder) for folder in folders} == set(tmp_path.iterdir())
@@ -116,7 +120,7 @@ def test_streets_of_other_settings_lie_beside_each_other(tmp_path, capsys):
 
 def test_a_street_is_checked_like_a_log(tmp_path, capsys):
     with unchecked():
-        assert data(["check", "data=synthetic", *SMALL, f"data.log.root={tmp_path / 'mine'}"]) == 0
+        assert data(["check", "data=synthetic", *SMALL, f"data.log.root={tmp_path / 'mine'}", SPLIT]) == 0
     assert "2 x 1" in capsys.readouterr().out
     assert (tmp_path / "mine/images/000_0.jpg").is_file()
     (tmp_path / "mine/images/000_0.jpg").unlink()

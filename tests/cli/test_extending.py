@@ -205,7 +205,7 @@ def test_a_number_of_a_finished_run(run, tiny_street):
 
 
 def test_a_reader(tmp_path, capsys):
-    words = [OUTSIDE, "data=pictures", "data.log.focal=20", f"data.root={tmp_path}"]
+    words = [OUTSIDE, "data=pictures", "data.log.focal=20", f"data.root={tmp_path}", "split.stride=0"]
     assert data(["check", *words]) == 1
     assert "there is no picture" in capsys.readouterr().out
     for index in range(3):

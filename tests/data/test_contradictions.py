@@ -183,6 +183,11 @@ def at_place(place: int, change: Tensor) -> Callable[[Track], Track]:
     return changed
 
 
+def first_boxes(one: Track, count: int) -> Track:
+    times = None if one.times is None else one.times[:count]
+    return replace(one, frames=one.frames[:count], world_from_object=one.world_from_object[:count], times=times)
+
+
 def sparse(points_change: Tensor, pose_change: Callable[[Tensor], Tensor] = lambda pose: pose) -> DrivingLog:
     """A wall's points in their colors, and images of it, in the turned world; then points or poses are changed."""
     draw = torch.rand(700, 2, generator=torch.Generator().manual_seed(0)) * torch.tensor([14.0, 7.0])
@@ -275,6 +280,14 @@ FAULTS = {
     "a jump": (
         lambda: boxes(at_place(4, rigid(0, (30.0, 0, 0))), "moving"),
         "object moving (car) jumps: at frame 5 its box is 30.0 m beside",
+    ),
+    "a jump of few boxes": (
+        lambda: boxes(lambda one: first_boxes(at_place(4, rigid(0, (30.0, 0, 0)))(one), 8), "moving"),
+        "object moving (car) jumps: at frame 5 its box is 30.0 m beside",
+    ),
+    "a jump of three": (
+        lambda: boxes(lambda one: first_boxes(at_place(1, rigid(0, (30.0, 0, 0)))(one), 3), "parked"),
+        "object parked (car) moves by 300 m/s",
     ),
     "a box turned": (
         lambda: boxes(at_place(4, rigid(180, (0, 0, 0))), "bike"),

@@ -65,7 +65,7 @@ def test_a_camera_that_cannot_be_held_out(cameras, said):
 @pytest.mark.parametrize(
     ("choice", "message"),
     [
-        ({"stride": 1, "offset": 0}, "all 12 frames"),
+        ({"stride": 1, "offset": 0}, "holds out all of 12 frames"),
         ({"stride": 5, "offset": 6}, "offset <= stride"),
         ({"stride": 5, "offset": -1}, "offset <= stride"),
         ({"stride": -2, "offset": 0}, "offset <= stride"),

@@ -132,6 +132,20 @@ def moving(frames: list[int], stamps: list[int]) -> Boxes:
     return Boxes("car", "Car", np.array(frames), poses, np.ones((len(frames), 3)), Path("boxes"), tuple(stamps))
 
 
+def test_boxes_of_one_object_that_differ_in_size_are_told():
+    """One grows in length; the other is measured to a few centimeters."""
+    grown, measured = moving([0, 1, 2], [100, 110, 125]), replace(moving([0, 2], [100, 125]), name="van")
+    grown.sizes[2, 0], measured.sizes[1, 2] = 3.0, 1.09
+    shots = [Shot(frame, 0, torch.eye(4, dtype=torch.float64), None, "", 100 + frame) for frame in range(3)]
+    black = torch.zeros(16, 24, 3, dtype=torch.uint8)
+    recording = Recording(
+        "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=(100, 101, 102),
+        boxes=[grown, measured],
+    )  # fmt: skip
+    said = [note for note in log_of(recording, cache_bytes=0, check=list).notes if "differ" in note]
+    assert said == ["the boxes of some objects differ in size, their mean is taken: car, length 1.00 to 3.00 m"]
+
+
 @pytest.mark.parametrize(
     ("frames", "annotated", "there"),
     [

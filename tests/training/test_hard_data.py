@@ -148,7 +148,7 @@ def test_boxes_beside_each_other_share_nothing():
     """A cyclist a hand's breadth beside the car, and one who passes within it for a quarter of the time."""
     beside = replace(box("beside", (1.8, 0.6, 1.7)), world_from_object=box("x").world_from_object + _aside(1.3))
     passing = box("passing", (1.8, 0.6, 1.7)).world_from_object.clone()
-    passing[3:] += _aside(1.2)
+    passing[3:] += _aside(-1.2)
     log = changed(lambda frame: frame, beside, replace(box("passing", (1.8, 0.6, 1.7)), world_from_object=passing))
     assert doubts(log) == ()
 

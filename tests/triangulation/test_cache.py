@@ -17,6 +17,7 @@ FRAMES = tuple(
     )
     for index in range(2)
 )  # fmt: skip
+TURN = torch.tensor([[0.0, -1, 0, 2], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=torch.float64)
 TRACK = Track("car", "Vehicle", torch.tensor([0, 1]), torch.eye(4, dtype=torch.float64).repeat(2, 1, 1), torch.ones(3))
 
 
@@ -101,7 +102,7 @@ def test_another_frame_makes_other_points(tmp_path, made, other):
         (),
         (replace(TRACK, name="bus"),),
         (replace(TRACK, frames=torch.tensor([0, 2])),),
-        (replace(TRACK, world_from_object=2 * TRACK.world_from_object),),
+        (replace(TRACK, world_from_object=TRACK.world_from_object @ TURN),),
         (replace(TRACK, size=2 * TRACK.size),),
     ],
     ids=["none", "name", "frames", "poses", "size"],
