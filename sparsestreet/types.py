@@ -9,7 +9,6 @@ Conventions, everywhere:
 - Images are float32 in [0, 1] at the splat op, and uint8 in storage.
 """
 
-import re
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -19,29 +18,6 @@ from torch import Tensor
 
 Side = Literal["top", "bottom", "left", "right"]
 """A side of an image."""
-
-
-_NO_MEMORY = re.compile(r"(not enough|out of|insufficient|no) memory", re.IGNORECASE)
-
-
-class DemandError(RuntimeError):
-    """What was asked for takes more than this machine has, or an op may hold; the sentence ends with the remedy."""
-
-
-def as_demand(error: BaseException) -> DemandError | None:
-    """Return an error by which Python, numpy, torch, OpenCV or our op say that memory is out as one; None: another.
-
-    >>> as_demand(RuntimeError("CUDA out of memory"))
-    DemandError('memory is out (CUDA out of memory): ask for smaller images or fewer Gaussians')
-    >>> as_demand(KeyError("memory")) is None
-    True
-    """
-    if isinstance(error, DemandError):
-        return error
-    if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
-        return None
-    said = " ".join(str(error).split())[:300]
-    return DemandError(f"memory is out{f' ({said})' if said else ''}: ask for smaller images or fewer Gaussians")
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from sparsestreet.cli.process import nobody_reads
+from sparsestreet.demand import as_demand
 
 Options = TypeVar("Options")
 
@@ -39,7 +40,7 @@ def run_command(
     """Parse the words of ``sparsestreet NAME`` and act on them.
 
     Returns 0, or 2 for words that do not fit, 1 where the action finds something missing or malformed (OSError,
-    ValueError, ImportError: its sentence is printed) or memory does not do (``types.as_demand``), 130 after Ctrl-C.
+    ValueError, ImportError: its sentence is printed) or memory does not do (``demand.as_demand``), 130 after Ctrl-C.
     Without words, and for --help, the usage is printed.
     """
     if not words or "--help" in words or "-h" in words:
@@ -57,8 +58,6 @@ def run_command(
         print(f"sparsestreet {name}: {error}", file=sys.stderr)
         return 1
     except Exception as error:
-        from sparsestreet.types import as_demand  # torch, which whatever failed has imported
-
         demand = as_demand(error)
         if demand is None:
             raise

@@ -24,6 +24,7 @@ from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
 from sparsestreet.cli.sweep import SweepFolder, as_sweep, note_of_sweep, run_job, sentence, sweep_problem, sweep_status
+from sparsestreet.demand import as_demand
 
 _started = 0.0
 """``time.perf_counter`` when the command began."""
@@ -113,8 +114,6 @@ def app(cfg: DictConfig) -> float | None:
         print(f"sparsestreet train{f', {name}' if name else ''}: {sentence(error)}", file=sys.stderr)
         sys.exit(1)
     except Exception as error:
-        from sparsestreet.types import as_demand
-
         demand = as_demand(error)
         if demand is None or "HYDRA_FULL_ERROR" in os.environ:
             raise

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.types import DemandError
+from sparsestreet.demand import DemandError
 
 LEAST_ALPHA = 1e-6
 """Depth is divided by alpha, or by this where a pixel is emptier."""

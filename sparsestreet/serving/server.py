@@ -15,13 +15,13 @@ from typing import Any, NoReturn
 import grpc
 
 import sparsestreet
+from sparsestreet.demand import as_demand
 from sparsestreet.records.provenance import this_source
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
 from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
 from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
 from sparsestreet.serving.turns import Turns
-from sparsestreet.types import as_demand
 
 log = logging.getLogger(__name__)
 
