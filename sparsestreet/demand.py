@@ -1,4 +1,4 @@
-"""Errors for what takes more than there is. Without torch, so that every command knows them at once."""
+"""Errors of an input that asks for too much: their own kind, which commands and the server know. No torch."""
 
 import re
 

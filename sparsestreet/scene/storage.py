@@ -97,7 +97,7 @@ def _check_kind(path: Path) -> None:
         head = file.read(9)
     found = SUFFIX if head[:8] == MAGIC else ".safetensors" if head[8:] == b"{" and head[4:8] == bytes(4) else None
     if found is not None and (found == path.suffix or (path.suffix not in _OURS and found != SUFFIX)):
-        return
+        return _check_tensors(path) if found != SUFFIX else None
     if found is not None:
         raise ValueError(f"{path} is a {found} by its first bytes: give it that ending")
     what = next((what for what, endings in _OF_ENDINGS.items() if path.suffix.lower() in endings), None)
@@ -108,13 +108,21 @@ def _check_kind(path: Path) -> None:
         raise ValueError(f"{path} holds {what}, not a scene: open the run's folder, its {FILE_NAME} or a {SUFFIX}")
 
 
+def _check_tensors(path: Path) -> None:
+    try:
+        with safe_open(path, framework="pt") as file:
+            ours = _KEY in (file.metadata() or {})
+    except SafetensorError:
+        return  # who reads it says what is wrong
+    if not ours:
+        raise ValueError(f"{path}: the file holds tensors but no scene of ours: give the {FILE_NAME} that a run wrote")
+
+
 def _read_scene(path: Path) -> StoredScene:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
-        if _KEY not in metadata:
-            raise ValueError(f"the file holds tensors but no scene of ours: give the {FILE_NAME} that a run wrote")
         return scene_of(json.loads(metadata[_KEY]), tensors)
     except (SafetensorError, json.JSONDecodeError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         # Whatever else is wrong: the header does not say what the tensors are.

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from sparsestreet.cli import scene
 from sparsestreet.cli.evaluate import evaluate
@@ -39,6 +40,15 @@ def test_every_command_names_a_file_of_another_kind(command, more, tmp_path, mon
     assert "car.ply holds Gaussians of one moment for viewers, or points, not a scene: open the run's folder" in said
     assert len(said.strip().splitlines()) == 1
     assert [one.name for one in tmp_path.iterdir()] == ["car.ply"]
+
+
+@pytest.mark.parametrize("command", [serve, evaluate, objects])
+def test_so_it_does_tensors_of_another_program(command, tmp_path, monkeypatch, capsys):
+    """Also where it would look for files beside the scene first."""
+    monkeypatch.chdir(tmp_path)
+    save_file({"weight": torch.zeros(3)}, "model.safetensors")
+    assert command(["model.safetensors"]) == 1
+    assert "model.safetensors: the file holds tensors but no scene of ours" in capsys.readouterr().err
 
 
 def test_so_does_an_edit_that_inserts_it(tmp_path, capsys):
