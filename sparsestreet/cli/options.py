@@ -44,7 +44,9 @@ def run_command(
     try:
         action(parse_options(words, kind, positional))
     except OptionError as error:
-        print(f"sparsestreet {name}: {error}", file=sys.stderr)
+        # The form of a command is the first of its usage, up to its meaning.
+        form = f": {usage.splitlines()[0].partition('  ')[0]}" if str(error).endswith("is missing") else ""
+        print(f"sparsestreet {name}: {error}{form}", file=sys.stderr)
         return 2
     except (OSError, ValueError, ImportError) as error:
         if isinstance(error, BrokenPipeError) and nobody_reads():

@@ -59,6 +59,8 @@ the pictures:
 """
 
 PATHS = ("recorded", "shifted", "lane_change")
+_SLOW = 5.0
+"""Frames a second below which a video is a row of stills."""
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances", "seen", "lidar")
 
 
@@ -139,6 +141,11 @@ def _render(request: RenderRequest) -> None:
         print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
     returns = returns_of(folder_of(request.scene), views) if "lidar" in request.layers else None
     path, fps, what = _path(request, views, log_fps)
+    if request.fps is None and not request.path_file and fps < _SLOW:
+        print(
+            f"{fps:g} frames a second, as the log has: fps=20 shows poses between them (data.log.rate=all, in "
+            "training, reads every image of a log that has keyframes)"
+        )
     count = _write(request, stored, _seen_by(request, path), fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"
     print(f"{request.out}: {count} frames of {what} at {fps:g} a second{_speed(request, log_fps)}, {made}")

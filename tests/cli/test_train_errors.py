@@ -18,10 +18,12 @@ from sparsestreet.cli.train import train
         (["data=drivestudio"], "data.root has no value"),
         (["schedule.max_steps=abc"], "must be a whole number, 1 or more, got 'abc'"),
         (["resume=/nowhere/at/all"], "there is nothing"),
+        (["out=/proc/nope/run"], "/proc/nope/run cannot be written ("),
+        ([f"out=/tmp/{'x' * 300}"], "cannot be written (File name too long): name another place"),
     ],
 )
 def test_a_slip_is_one_line_before_hydra_sees_it(overrides, said, tmp_path, capsys):
-    assert train([*overrides, f"out={tmp_path / 'run'}"]) == 2
+    assert train([f"out={tmp_path / 'run'}", *overrides]) == 2
     written = capsys.readouterr().err
     assert said in written
     assert written.count("\n") == 1
