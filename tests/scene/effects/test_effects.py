@@ -97,8 +97,10 @@ def test_a_scene_has_what_its_log_calls_for(lens: bool, shutter: bool, caplog):
     wanted = {"sky": True, "lens": lens, "shutter": shutter}
     with caplog.at_level(logging.INFO):
         assert list(built(ALL, log_through(lens, shutter))) == [name for name, has in wanted.items() if has]
-    state = "is on: 1 of 1" if lens else "is not needed: 0 of 1"
-    assert f"effect 'lens' {state} cameras of hand-made have a lens" in caplog.text
+    # One line for each that is on, and one for all others.
+    assert ("effect 'lens' is on: 1 of 1 cameras of hand-made have a lens" in caplog.text) is lens
+    rest = ", ".join(name for name, has in wanted.items() if not has)
+    assert (f"effects that are not on: {rest} (sparsestreet effects says why)" in caplog.text) is bool(rest)
 
 
 def test_a_lens_is_simulated_where_it_moves_pixels_far_enough():
