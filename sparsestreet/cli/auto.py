@@ -48,6 +48,8 @@ def found_option(root: Path, searchpath: Sequence[str] = ()) -> tuple[str, Path]
     if not root.is_dir():
         what = "is a file" if root.exists() else "is not there"
         raise ValueError(f"data.root={root} {what}: name the folder of a log")
+    if not any(root.iterdir()):
+        raise ValueError(f"data.root={root} is an empty folder: name that of a log; {_MORE}")
     marks = _marks_of_options(tuple(searchpath))
     known = _known_as(root, marks)
     if len(known) == 1:

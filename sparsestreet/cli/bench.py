@@ -31,7 +31,7 @@ EXAMPLES = """\
 examples:
   sparsestreet bench                            knobs, on five scenes; the street is a proxy scene made of numbers
   sparsestreet bench knobs --street RUN         the street of a run that train wrote; its exact images take minutes
-  sparsestreet bench knobs --quick              the same at sizes that take seconds: to see that it runs
+  sparsestreet bench knobs --quick              the same at sizes that take a minute or two: to see that it runs
   sparsestreet bench blend                      stages of the C++ backend beside vectorized torch, and the floor
   sparsestreet bench step                       phases of a training step: time, operations, distance to their floors
   sparsestreet bench step sparsify=paper        the same of another training: options as those of train
@@ -92,7 +92,12 @@ def _parser(modes: list[str]) -> argparse.ArgumentParser:
     )
     parser.add_argument("mode", nargs="?", default="knobs", choices=modes, help="what to measure (default: knobs)")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="step: options of train")
-    parser.add_argument("--quick", action="store_true", help="tiny sizes, few repeats: seconds; its times mean little")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="tiny sizes, few repeats: a minute or two of one core, and of knobs "
+        "half a minute more for each tile size, compiled into .cache/tiles of the checkout; its times mean little",
+    )
     parser.add_argument(
         "--street", type=Path, metavar="RUN", help="knobs, gpu, edits, serve: the trained street of this run's folder"
     )

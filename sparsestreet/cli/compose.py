@@ -163,7 +163,11 @@ def _as_typed(text: str, several: bool) -> str:
     except HydraException:
         plain = not set(value) & set("[]{}()'\",")
         return f"{key}={_in_quotes(value)}" if path or plain else text
-    if not path or value == "null" or (override.is_sweep_override() and several and not Path(value).exists()):
+    if (
+        not path
+        or value == "null"
+        or (override.is_sweep_override() and (several or key != "out") and not Path(value).exists())
+    ):
         return text
     return text if override.value() == value else f"{key}={_in_quotes(value)}"
 

@@ -4,6 +4,8 @@ import logging
 import os
 import re
 import shutil
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -49,9 +51,8 @@ _ALIKE = ("seed", "data.root", "data.log.root")
 def folder_problem(cfg: DictConfig, out: Path) -> str | None:
     """One line where ``out`` cannot be written, has links out of it, or holds a run that nobody asked to replace or
     to go on with."""
-    there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        return f"{out} cannot be written: name another place with out=..."
+    if reason := _unwritable(out):
+        return f"{out} cannot be written ({reason}): name another place with out=..."
     try:
         check_links(out)
     except OSError as error:
@@ -65,6 +66,27 @@ def folder_problem(cfg: DictConfig, out: Path) -> str | None:
         return f"{out} holds this very run, finished: sparsestreet evaluate run={out}, or replace it: overwrite=true"
     said = f" ({run.label}, seed {run.seed})" if run else ""
     return f"{out} holds another run{said}: name another place with out=..., or replace it: overwrite=true"
+
+
+def _unwritable(out: Path) -> str | None:
+    """Why a folder cannot be made or written to; None where it can. What is made to see it is removed again.
+
+    Asked by doing: some file systems (/proc, a mount that is read-only) refuse what their permissions allow.
+    """
+    made: list[Path] = []
+    try:
+        absent = [folder for folder in (out.absolute(), *out.absolute().parents) if not folder.exists()]
+        for folder in reversed(absent):
+            folder.mkdir(exist_ok=True)
+            made.append(folder)
+        with tempfile.TemporaryDirectory(dir=out, prefix="."):
+            return None
+    except OSError as error:
+        return error.strerror or str(error)
+    finally:
+        with suppress(OSError):  # somebody else has begun to write there
+            for folder in reversed(made):
+                folder.rmdir()
 
 
 def start_of(cfg: DictConfig, out: Path) -> Path | None:

@@ -63,6 +63,8 @@ the pictures:
 PATHS = ("recorded", "shifted", "lane_change")
 SLOWEST, FASTEST = 0.001, 1000.0
 """Frames a second of a video."""
+_SLOW = 5.0
+"""Frames a second below which a video is a row of stills."""
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances", "seen", "lidar")
 
 
@@ -154,6 +156,11 @@ def _render(request: RenderRequest) -> None:
     stored = with_edits(stored, views, request.edits)
     if stored.scene.exposed(views.all[0]) is not None:
         print("the pictures are sharp: what blurred those of the log is left out")
+    if request.fps is None and not request.path_file and fps < _SLOW:
+        print(
+            f"{fps:g} frames a second, as the log has: fps=20 shows poses between them (data.log.rate=all, in "
+            "training, reads every image of a log that has keyframes)"
+        )
     returns = returns_of(folder_of(request.scene), views, request.parts) if "lidar" in request.layers else None
     count = _write(request, stored, path, fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"

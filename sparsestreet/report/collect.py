@@ -28,6 +28,8 @@ def collect(roots: Iterable[Path]) -> list[RunRecord]:
     """
     folders: set[Path] = set()
     for root in roots:
+        if not root.is_dir():
+            raise FileNotFoundError(f"{root} {'is a file' if root.exists() else 'is not there'}: name a folder of runs")
         found = SUMMARY.runs(root)
         if not found:
             raise FileNotFoundError(f"{root} holds no {SUMMARY.name}: train and evaluate a run there first")

@@ -10,13 +10,16 @@ from sparsestreet.records.summary import SUMMARY, RunSummary
 from sparsestreet.report.variants import variants
 
 
-def compare_runs(runs: Sequence[Path], sheet: Path, *, legend: Legend | None = None) -> None:
+def compare_runs(
+    runs: Sequence[Path], sheet: Path, *, legend: Legend | None = None, titles: Sequence[str] | None = None
+) -> None:
     """Writes a sheet with a column for each run: renders, errors and centers of the images that all of them show.
 
     Args:
         runs: at least two run folders with records and pictures of the same images. Shares refer to the first.
         sheet: PNG to write.
         legend: node -> RGB of its centers, drawn on the sheet.
+        titles: what each run is called; None: as in the report's tables.
 
     Raises RecordError for malformed records, ValueError if the runs are of different scenes or show different images.
     """
@@ -24,7 +27,7 @@ def compare_runs(runs: Sequence[Path], sheet: Path, *, legend: Legend | None = N
     scenes = {summary.run.scene for summary in summaries}
     if len(scenes) > 1:
         raise ValueError(f"the runs show different scenes, {', '.join(sorted(scenes))}: compare runs of one scene")
-    names = _names(summaries)
+    names = list(titles) if titles is not None else _names(summaries)
     columns = [
         _column(run, summary, name, names[0], summaries[0].gaussians_total)
         for run, summary, name in zip(runs, summaries, names, strict=True)

@@ -72,14 +72,15 @@ def _effects(plan: EffectPlan, data: TrainingData, seed: int) -> dict[str, Effec
             built[name] = settings.build(data, planned.finding, named_generator(seed, name))
         elif settings.when == "off" or planned.finding.value:  # it is in the cameras, and is taken from them
             built[name] = settings.left_out()
-        _log.info("effect %r is %s: %s", name, _word(planned), planned.finding.reason)
+        if planned.on or planned.only_found:
+            _log.info("effect %r is %s: %s", name, _word(planned), planned.finding.reason)
+    if rest := [planned.name for planned in plan.effects if not (planned.on or planned.only_found)]:
+        _log.info("effects that are not on: %s (sparsestreet effects says why)", ", ".join(rest))
     return {name: effect for name, effect in built.items() if effect is not None}
 
 
 def _word(planned: PlannedEffect) -> str:
-    if planned.settings.when == "auto":
-        return "on" if planned.on else "found, not simulated" if planned.only_found else "not needed"
-    return f"forced {planned.settings.when}"
+    return "found, not simulated" if not planned.on else "on" if planned.settings.when == "auto" else "forced on"
 
 
 def _report(assignment: Assignment) -> None:

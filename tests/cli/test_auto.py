@@ -69,6 +69,11 @@ def test_colmaps_cameras_are_no_other_calibration(tmp_path):
     assert found_option(touch(tmp_path / "b", "cameras.txt"))[0] == "colmap"
 
 
+def test_an_empty_folder_is_one_line(tmp_path):
+    with pytest.raises(ValueError, match=rf"data.root={tmp_path} is an empty folder: name that of a log; [^\n]*$"):
+        found_option(tmp_path)
+
+
 def test_a_folder_in_quotes(tmp_path):
     odd = touch(tmp_path / "a, b=c", FILES["nuscenes"])
     assert with_found_data(["data=auto", f"data.root='{odd}'"])[0][0] == "data=nuscenes"

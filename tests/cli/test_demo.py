@@ -16,7 +16,9 @@ from sparsestreet.pictures.images import KINDS, picture_path, write_png
 from sparsestreet.records.quality import HELD_OUT, QUALITY
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.centers import node_legend
-from tests.evaluation.frames import make_image, make_summary
+from tests.evaluation.frames import disturbed, make_image, make_summary
+
+TITLES = ["plain", "the paper's method (short)", "ours"]
 
 
 @pytest.fixture
@@ -48,12 +50,42 @@ def test_three_runs_one_table_and_pictures(asked, capsys):
         for name in names
     ]  # fmt: skip
     runs = [out / name for name in names]
-    assert (given, named) == ((runs, out / "comparison.png"), {"legend": node_legend({"background": 7, "rigid": 2})})
+    assert (given, named) == (
+        (runs, out / "comparison.png"),
+        {"legend": node_legend({"background": 7, "rigid": 2}), "titles": TITLES},
+    )
     assert words == [*map(str, runs), "baseline=none", "markdown=outputs/demo/table.md"]
     said = capsys.readouterr().out
     assert "pictures: outputs/demo/comparison.png, outputs/demo/removal/pictures/sheet.png (0 s in all)" in said
     assert "sparsestreet render scene=outputs/demo/removal path=shifted offset=1.5 out=drive.mp4" in said
     assert [f"== sparsify={name} ==" in said for name in names] == [True] * 3
+
+
+def test_the_one_comparison_is_the_last_table(trained, tmp_path, monkeypatch, capsys):
+    """Headed by words, with the mark of times that were disturbed; the long tables come before it."""
+    train = module.subprocess.run
+
+    def disturbed_at_first(command, check):
+        done = train(command, check)
+        run = tmp_path / "d" / "none"
+        if len(trained) == 1:
+            SUMMARY.write(run, disturbed(SUMMARY.read(run), "training"))
+        return done
+
+    monkeypatch.setattr(module.subprocess, "run", disturbed_at_first)
+    assert demo([f"out={tmp_path / 'd'}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    heads = [number for number, line in enumerate(lines) if "┃" in line]
+    last = [
+        [cell.strip() for cell in line.replace("┃", "│").split("│")[1:-1]]
+        for line in lines[heads[-1] :]
+        if "│" in line or "┃" in line
+    ]
+    assert last[0] == ["", *TITLES]
+    assert last[1] == ["held-out PSNR, dB", "21.00", "22.00", "23.00"]
+    assert last[-1] == ["seconds of training", "100 §", "100", "100"]
+    assert any("not quiet" in line for line in lines[heads[-1] :])
+    assert len(lines) - heads[-1] < 14
 
 
 def test_the_first_failure_ends_it(asked, monkeypatch):
@@ -84,7 +116,7 @@ def trained(monkeypatch):
         return SimpleNamespace(returncode=0)
 
     monkeypatch.setattr(module.subprocess, "run", train)
-    monkeypatch.setattr(module, "compare_runs", lambda runs, sheet, legend: sheet.parent.mkdir(exist_ok=True))
+    monkeypatch.setattr(module, "compare_runs", lambda runs, sheet, legend, titles: sheet.parent.mkdir(exist_ok=True))
     return words
 
 

@@ -4,6 +4,7 @@ import math
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -146,9 +147,19 @@ def test_what_is_no_run_is_no_obstacle(tmp_path):
 def test_a_place_that_cannot_be_written_is_said_at_once(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     for out in (tmp_path / "file", tmp_path / "file/run"):
-        assert folder_problem(composed(()), out) == f"{out} cannot be written: name another place with out=..."
-    monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)  # root may write anywhere
-    assert "cannot be written" in there(folder_problem(composed(()), tmp_path / "deep/run"))
+        problem = f"{out} cannot be written (Not a directory): name another place with out=..."
+        assert folder_problem(composed(()), out) == problem
+    assert folder_problem(composed(()), tmp_path / "deep/er/run") is None
+    mkdir = Path.mkdir
+
+    def refused(folder: Path, **options: Any) -> None:  # root may write anywhere
+        if folder.name == "run":
+            raise PermissionError(13, "Permission denied")
+        mkdir(folder, **options)
+
+    monkeypatch.setattr(Path, "mkdir", refused)
+    assert "cannot be written (Permission denied)" in there(folder_problem(composed(()), tmp_path / "deep/run"))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_refused_run_is_left_as_it_is(tmp_path, capsys):

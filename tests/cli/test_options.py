@@ -148,3 +148,10 @@ def test_an_action_gets_the_options():
     seen = []
     assert run_command("film", "USAGE", ["scene=r"], Wishes, seen.append) == 0
     assert seen == [Wishes(Path("r"))]
+
+
+def test_what_is_missing_comes_with_the_form_of_the_command(capsys):
+    usage = "sparsestreet shows RUN FILE [key=value ...]     what was seen\n\n  scene   a run"
+    assert run_command("shows", usage, ["width=5"], Wishes, print) == 2
+    said = "sparsestreet shows: scene=... is missing: sparsestreet shows RUN FILE [key=value ...]\n"
+    assert capsys.readouterr().err == said

@@ -25,10 +25,12 @@ from sparsestreet.cli.train import train
             "loss.mine._target_: there is no module mypaper; is its folder in PYTHONPATH?",
         ),
         (["++loss.mine._target_=tests.cli.toy.Kite"], "loss.mine._target_ names tests.cli.toy.Kite, which cannot be"),
+        (["out=/proc/nope/run"], "/proc/nope/run cannot be written ("),
+        ([f"out=/tmp/{'x' * 300}"], "cannot be written (File name too long): name another place"),
     ],
 )
 def test_a_slip_is_one_line_before_hydra_sees_it(overrides, said, tmp_path, capsys):
-    assert train([*overrides, f"out={tmp_path / 'run'}"]) == 2
+    assert train([f"out={tmp_path / 'run'}", *overrides]) == 2
     written = capsys.readouterr().err
     assert said in written
     assert written.count("\n") == 1

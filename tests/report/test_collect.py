@@ -48,3 +48,13 @@ def test_a_report_imports_no_torch():
     """What import contracts cannot see: imports inside of functions, and the command."""
     code = "import sys, sparsestreet.cli.report; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_folder_that_is_not_there_has_no_runs_to_train(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nosuch is not there: name a folder of runs"):
+        collect([tmp_path / "nosuch"])
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(FileNotFoundError, match=r"a\.txt is a file: name a folder of runs"):
+        collect([tmp_path / "a.txt"])
+    with pytest.raises(FileNotFoundError, match=r"holds no records/summary\.json"):
+        collect([tmp_path])

@@ -97,8 +97,11 @@ def test_a_scene_has_what_its_log_calls_for(lens: bool, shutter: bool, caplog):
     wanted = {"sky": True, "lens": lens, "shutter": shutter}
     with caplog.at_level(logging.INFO):
         assert list(built(ALL, log_through(lens, shutter))) == [name for name, has in wanted.items() if has]
-    state = "is on: 1 of 1" if lens else "is not needed: 0 of 1"
-    assert f"effect 'lens' {state} cameras of hand-made have a lens" in caplog.text
+    # One line for each that is on, and one for all others.
+    assert ("effect 'lens' is on: 1 of 1 cameras of hand-made have a lens" in caplog.text) is lens
+    rest = [message for message in caplog.messages if message.startswith("effects that are not on: ")]
+    assert all(message.endswith(" (sparsestreet effects says why)") for message in rest)
+    assert [message.count("lens") for message in rest] == ([] if lens and not rest else [int(not lens)])
 
 
 def test_a_lens_is_simulated_where_it_moves_pixels_far_enough():
