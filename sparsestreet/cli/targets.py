@@ -34,7 +34,7 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
-class Named:
+class ClosedList:
     """What the files of conf/ name."""
 
     targets: Mapping[str, frozenset[str]]
@@ -47,7 +47,7 @@ class Named:
 
 
 @cache
-def named_by_conf() -> Named:
+def named_by_conf() -> ClosedList:
     """Returns the closed list. It leaves out ``hydra``, which is no part of a run."""
     targets: dict[str, set[str]] = {}
     values, texts = set(), set()
@@ -67,7 +67,7 @@ def named_by_conf() -> Named:
             targets.setdefault(name, set()).add(group if group in _ROOTS else "")
     rooted = {name: frozenset() if "" in roots else frozenset(roots) for name, roots in targets.items()}
     resolvers = {name for text in texts for name in re.findall(r"\$\{([\w.]+):", text)}
-    return Named(rooted, frozenset(values), frozenset(texts), frozenset(resolvers))
+    return ClosedList(rooted, frozenset(values), frozenset(texts), frozenset(resolvers))
 
 
 def leaves(tree: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
