@@ -17,6 +17,10 @@ def check_regular(path: Path) -> None:
     """Raises OSError for a pipe, a socket or a device, by a link too: who opens one may wait for ever.
 
     What is not there is no matter of this check.
+
+    >>> check_regular(Path("/dev/null"))
+    Traceback (most recent call last):
+    OSError: /dev/null is a pipe, a socket or a device, and no file: put the file itself in its place
     """
     mode = path.stat().st_mode if path.exists() else stat.S_IFREG
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):

@@ -71,10 +71,12 @@ def folder_problem(cfg: DictConfig, out: Path) -> str | None:
 def _unwritable(out: Path) -> str | None:
     """Why a folder cannot be made or written to; None where it can. What is made to see it is removed again.
 
-    Asked by doing: some file systems (/proc, a mount that is read-only) refuse what their permissions allow.
+    Asked by doing: some file systems (/proc) refuse what their permissions allow. A folder that is there stays as it is.
     """
     made: list[Path] = []
     try:
+        if out.is_dir():
+            return None if os.access(out, os.W_OK | os.X_OK) else "Permission denied"
         absent = [folder for folder in (out.absolute(), *out.absolute().parents) if not folder.exists()]
         for folder in reversed(absent):
             folder.mkdir(exist_ok=True)

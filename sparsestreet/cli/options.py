@@ -49,7 +49,8 @@ def run_command(
     try:
         action(parse_options(words, kind, positional))
     except OptionError as error:
-        form = f": {' '.join(usage.partition(chr(10))[0].split())}" if isinstance(error, MissingOptionError) else ""
+        # The form of a command is the first of its usage, up to its meaning.
+        form = f": {usage.splitlines()[0].partition('  ')[0]}" if isinstance(error, MissingOptionError) else ""
         print(printable(f"sparsestreet {name}: {error}{form}"), file=sys.stderr)
         return 2
     except (OSError, ValueError, ImportError) as error:

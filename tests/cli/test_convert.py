@@ -110,7 +110,7 @@ def test_after_ctrl_c_the_same_command_goes_on(tmp_path, capsys, monkeypatch):
         (["from={log}", "to={out}", "data.log.last_frme=3"], 2, "no key 'data.log.last_frme'"),
         (["from={log}", "to={out}", "data.log.last_frame=30"], 1, "are not within the log's 0 to 2"),
         (["from={log}", "to={full}"], 1, "is no empty folder: name another place with to=..., or remove it"),
-        (["from={empty}", "to={out}"], 1, "no reader knows"),
+        (["from={empty}", "to={out}"], 1, "is an empty folder"),
     ],
 )
 def test_a_wrong_command_is_answered_and_nothing_is_written(words, status, said, tmp_path, capsys):

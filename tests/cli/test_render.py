@@ -261,7 +261,7 @@ def test_everything_that_is_asked_for_arrives(run, tmp_path, monkeypatch, capsys
     monkeypatch.setattr(video, "path_pictures", lambda *told: given.update(path=told) or iter(()))
     monkeypatch.setattr(video, "write_pictures", lambda *told, **how: given.update(written=(told, how)) or 77)
     assert render([f"scene={run}", f"out={tmp_path / 'o'}", "cameras=[2,0]", *words]) == 0
-    assert opened == [(run, expected["device"])]
+    assert opened == [(run, expected["device"], ())]
     shown, path = given["path"]
     assert shown is stored
     assert len(path) == expected["count"]

@@ -70,7 +70,7 @@ def test_it_is_opened_with_the_names_of_its_tracks_and_shows_what_the_run_showed
 
 def test_it_is_evaluated_and_reported(toy_run, capsys):
     before = SUMMARY.read(toy_run)
-    assert evaluate([f"run={toy_run}"]) == 0
+    assert evaluate([f"run={toy_run}", "parts=[tests.cli.toy]"]) == 0
     after = SUMMARY.read(toy_run)
     assert after.quality == before.quality
     assert after.gaussians["bobbing"] > 0

@@ -91,7 +91,7 @@ def test_masks_that_leave_nothing_are_named(share, tmp_path, console, recwarn):
     mask.reshape(-1)[round(share * mask.size) :] = 0
     for camera in range(2):
         Image.fromarray(mask).save(tmp_path / f"ego_masks/{camera}.png")
-    assert report_check(DriveStudioReader(tmp_path), console) == (share == 1)
+    assert report_check(DriveStudioReader(tmp_path), console, SPLIT) == (share == 1)
     said = {1.0: "6 of 6 images of", 0.99: "masks or alpha leave 1 % of the pixels of camera 0 to be used"}
     assert said[share] in console.file.getvalue()
     assert not recwarn

@@ -167,7 +167,7 @@ def test_attached_files_and_the_views_within(tmp_path: Path, path: Path):
 def test_a_file_that_is_not_there_and_one_of_another_kind(tmp_path: Path):
     with pytest.raises(FileNotFoundError, match="there is no scene at"):
         load_scene(tmp_path / "a.street")
-    (tmp_path / "a.street").write_bytes(b"ply\n" * 100)
+    (tmp_path / "a.street").write_bytes(b"\x01\x02\x03\x04" * 100)
     with pytest.raises(ValueError, match=r"a.street is no .street or is damaged: it does not start as a .street does"):
         load_scene(tmp_path / "a.street")
 
