@@ -71,7 +71,7 @@ def folder_problem(cfg: DictConfig, out: Path) -> str | None:
 def _unwritable(out: Path) -> str | None:
     """Why a folder cannot be made or written to; None where it can. What is made to see it is removed again.
 
-    Asked by doing: some file systems (/proc) refuse what their permissions allow. A folder that is there stays as it is.
+    Asked by doing: some file systems (/proc) refuse what permissions allow. One that is there stays as it is.
     """
     made: list[Path] = []
     try:
