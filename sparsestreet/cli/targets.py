@@ -6,6 +6,7 @@ outside come from modules that the user's command trusts (``parts=[mypaper]``).
 """
 
 import re
+import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -186,6 +187,13 @@ def _target_problem(place: Place, value: object, parts: Sequence[str]) -> str | 
             return None
         if roots is not None:
             return f"names {value!r}, which conf/ names below {' and '.join(sorted(roots))} alone: nothing was made"
+        package = value.partition(".")[0]
+        if package == "sparsestreet":
+            return (
+                f"names {value!r}, which conf/ of this version does not: another version wrote it, or do not trust it"
+            )
+        if package in sys.stdlib_module_names:
+            return f"names {value!r}, which is no part of a scene: nothing was made, and this run is not to be trusted"
         if re.fullmatch(r"\w+(\.\w+)+", value):
             module = value.rpartition(".")[0]
             return f"names {value!r}, which conf/ does not: say parts=[{module}] if its code is trusted"

@@ -303,3 +303,9 @@ def test_lists_in_lists_have_their_places():
         (("a", "1"), []),
         (("c",), {}),
     ]
+
+
+@pytest.mark.parametrize("target", ["os.system", "sparsestreet.cli.main"])
+def test_of_what_no_scene_has_nobody_is_asked_to_trust_the_module(target: str):
+    with pytest.raises(ValueError, match=r"(not to be trusted|do not trust it)$"):
+        check_received({"evaluation": {"_target_": target}}, Path("run"))
