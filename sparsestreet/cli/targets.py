@@ -189,9 +189,7 @@ def _target_problem(place: Place, value: object, parts: Sequence[str]) -> str | 
             return f"names {value!r}, which conf/ names below {' and '.join(sorted(roots))} alone: nothing was made"
         package = value.partition(".")[0]
         if package == "sparsestreet":
-            return (
-                f"names {value!r}, which conf/ does not: another version wrote the run, or do not trust it"
-            )
+            return f"names {value!r}, which conf/ does not: another version wrote the run, or do not trust it"
         if package in sys.stdlib_module_names:
             return f"names {value!r}, which is no part of a scene: nothing was made, and this run is not to be trusted"
         if re.fullmatch(r"\w+(\.\w+)+", value):
