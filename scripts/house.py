@@ -87,7 +87,7 @@ def main(top: Path) -> None:
         ("module, median lines", statistics.median(lines)),
         ("module, p90 lines", sorted(lines)[int(0.9 * len(lines))]),
         (f"modules below {SHORT} lines, without __init__", len(short)),
-        ("C++, lines", sum(lines_of(sorted((path for path in root.rglob("src/*") if path.is_file()))))),
+        ("C++, lines", sum(lines_of(sorted(path for path in root.rglob("src/*") if path.is_file())))),
         ("tests, lines", sum(lines_of(tests))),
         ("tests, files", len(tests)),
         ("conf, files", sum(path.is_file() for path in (top / "conf").rglob("*"))),
