@@ -26,7 +26,7 @@ SparseStreet: train scene graphs of 3D Gaussians from driving logs, make them sm
   sparsestreet export RUN street.ply                  its Gaussians for viewers, at a time, or one object of it
   sparsestreet serve RUN[,RUN] port=50051             pictures for simulators (AlpaSim, NuRec's clients) over gRPC
   sparsestreet data check DIR                         everything that is wrong with a log, at once
-  sparsestreet data convert from=DIR to=OUT           any log in DriveStudio's layout, or another data set's
+  sparsestreet data convert from=DIR to=OUT           any log in DriveStudio's layout
   sparsestreet data make seed=1                       write a synthetic street to disk
   sparsestreet effects data=auto data.root=DIR        which effects of cameras and light a log calls for, and why
   sparsestreet presets streetgs                       our presets beside DriveStudio's settings, key by key

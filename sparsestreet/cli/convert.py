@@ -1,8 +1,8 @@
-"""``sparsestreet data convert from=DIR to=DIR``: a log in the layout of a data set."""
+"""``sparsestreet data convert from=DIR to=DIR``: a log in DriveStudio's layout."""
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +10,19 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.layout import named_writer
+from sparsestreet.cli.checks import type_problem
 from sparsestreet.cli.named_log import UsageError, configured_log, reader_of
 from sparsestreet.cli.progress import shown
 from sparsestreet.data.convert import Source, check_free, partial_folder
 from sparsestreet.data.convert import convert as write_converted
+from sparsestreet.data.drivestudio import DriveStudioWriter
 from sparsestreet.data.reader import LogReader
 
 _NO_LOG = "no log is named: say sparsestreet data convert from=DIR to=DIR"
 _ONE_LOG = "data=synthetic has no folder to convert from: leave from=... out"
 _NOT_OF_A_LOG = ("root", "parent", "cache_mb")
 """Options of readers that change nothing of what is read."""
+_SETTINGS = tuple(field.name for field in fields(DriveStudioWriter))
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,8 @@ class _Words:
 
     to: Path
     origin: Path | None
-    layout: tuple[str, ...]
+    settings: tuple[str, ...]
+    """Of the writer: ``jpeg_quality=95``."""
     log: tuple[str, ...]
 
 
@@ -54,7 +57,7 @@ def convert(arguments: Sequence[str]) -> int:
 
 
 def _convert(words: _Words, to: Path) -> int:
-    writer = named_writer(words.layout, [text for text in words.log if text.startswith("hydra.searchpath=")])
+    writer = _writer(words.settings)
     cfg, found = configured_log(words.log, words.origin, no_log=_NO_LOG, one_log=_ONE_LOG)
     if found:
         print(found)
@@ -76,6 +79,18 @@ def _convert(words: _Words, to: Path) -> int:
     return 0
 
 
+def _writer(settings: Sequence[str]) -> DriveStudioWriter:
+    """Return the writer of ``jpeg_quality=95 flavor=waymo``. Raises UsageError for values that it does not take."""
+    values: Any = OmegaConf.to_container(OmegaConf.from_dotlist(list(settings)))
+    target = f"{DriveStudioWriter.__module__}.{DriveStudioWriter.__qualname__}"
+    if problem := type_problem({"_target_": target, **values}):
+        raise UsageError(problem)
+    try:
+        return DriveStudioWriter(**values)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
+
+
 def _source(name: str, reader: LogReader, cfg: DictConfig) -> Source:
     options: Any = OmegaConf.to_container(cfg.data.log, resolve=True)
     chosen = {key: value for key, value in options.items() if key not in _NOT_OF_A_LOG}
@@ -85,7 +100,7 @@ def _source(name: str, reader: LogReader, cfg: DictConfig) -> Source:
 def _sorted(arguments: Sequence[str]) -> _Words:
     """Raises UsageError for words that are given twice or not at all."""
     given: dict[str, Path] = {}
-    layout, log = [], []
+    settings, log = [], []
     for text in arguments:
         key, _, value = text.partition("=")
         if key in ("from", "to"):
@@ -93,9 +108,9 @@ def _sorted(arguments: Sequence[str]) -> _Words:
                 raise UsageError(f"{key}=DIR names one folder, got {' '.join(arguments)}")
             given[key] = Path(value).expanduser()
         else:
-            (layout if key.partition(".")[0] == "layout" else log).append(text)
+            (settings if key in _SETTINGS else log).append(text)
     if "to" not in given:
         raise UsageError("to=DIR is missing: name the folder that is written")
     if "from" in given and any(text.startswith("data.root=") for text in log):
         raise UsageError("from=DIR and data.root=DIR name the same: leave one out")
-    return _Words(given["to"], given.get("from"), tuple(layout), tuple(log))
+    return _Words(given["to"], given.get("from"), tuple(settings), tuple(log))

@@ -14,8 +14,10 @@ USAGE = """\
 sparsestreet data check DIR [data=nuscenes data.log.scene=scene-0061 data.log.last_frame=50 ...]
     print what is wrong with a log, or with the part that is chosen (exit status 1), or its summary;
     without data=... the folder's files tell which reader is asked
-sparsestreet data convert from=DIR to=DIR [data=... layout=drivestudio layout.jpeg_quality=95 ...]
-    write a log in the layout of a data set; the same command goes on where it was interrupted
+sparsestreet data convert from=DIR to=DIR [data=... jpeg_quality=95 flavor=auto ...]
+    write a log in DriveStudio's layout; the same command goes on where it was interrupted
+    jpeg_quality: 1 to 100; null writes PNGs under the layout's names in .jpg, without loss
+    flavor: waymo has rigid cameras on a vehicle, nuscenes a pose for each image; auto takes waymo for Waymo's logs
       sparsestreet data convert from=/data/nuscenes to=scene-0061 data.log.scene=scene-0061 data.log.width=960
       sparsestreet data convert data=synthetic seed=3 to=street
 sparsestreet data make [seed=N] [data.log.settings.width=W ...]

@@ -10,11 +10,11 @@ from sparsestreet.data.problems import fault
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.transforms import rigidity_error
 
+AHEAD_FROM_OPENCV = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
+"""Axes x ahead, y left, z up, which Waymo's cameras have too, from OpenCV's."""
 RIGIDITY_TOLERANCE = 1e-4
 """Largest entry of R^T R - I that is let through: it moves a point 100 m away by 5 mm, less than lidar noise, and is a
 hundred times what poses stored in float32 show."""
-
-
 _LENGTH_TOLERANCE = 1e-3
 """How far a quaternion's length may be from 1: one that was stored with four digits is let through, and made 1."""
 

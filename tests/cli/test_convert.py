@@ -1,19 +1,14 @@
-"""`sparsestreet data convert`: which log, which layout, and one line on what is wrong."""
+"""`sparsestreet data convert`: which log, which settings, and one line on what is wrong."""
 
 import json
 from collections.abc import Iterable, Iterator
-from dataclasses import MISSING, fields
-from typing import Any
 
 import pytest
-from omegaconf import OmegaConf
 
 from sparsestreet.cli import convert as module
-from sparsestreet.cli.compose import CONF
 from sparsestreet.cli.data import data
-from sparsestreet.data.convert import partial_folder
-from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
-from sparsestreet.data.writer import LogFile
+from sparsestreet.data.convert import LogFile, partial_folder
+from sparsestreet.data.drivestudio import DriveStudioReader
 from tests.cli.test_data import SMALL
 from tests.conftest import unchecked
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
@@ -37,10 +32,10 @@ def test_the_short_form_finds_the_reader_and_writes_drivestudios_layout(tmp_path
     assert DriveStudioReader(out).check() == []
 
 
-def test_the_part_the_layout_and_its_settings_are_chosen_by_keys(tmp_path, capsys):
+def test_the_part_and_the_settings_are_chosen_by_keys(tmp_path, capsys):
     log, out = make_nuscenes(tmp_path / "log"), tmp_path / "out"
     part = ["data.log.cameras=[1]", "data.log.last_frame=1", "data.log.width=20"]
-    words = ["data=drivestudio", f"data.root={log}", *part, "layout=drivestudio", "layout.jpeg_quality=null"]
+    words = ["data=drivestudio", f"data.root={log}", *part, "jpeg_quality=null"]
     assert converted(*words, f"to={out}") == 0
     assert {path.name for path in (out / "images").iterdir()} == {"000_1.jpg", "001_1.jpg"}
     assert (out / "images/000_1.jpg").read_bytes().startswith(b"\x89PNG")
@@ -97,16 +92,15 @@ def test_after_ctrl_c_the_same_command_goes_on(tmp_path, capsys, monkeypatch):
         (["from={log}", "data.root={log}", "to={out}"], 2, "name the same: leave one out"),
         (["from={log}", "data=synthetic", "to={out}"], 2, "leave from=... out"),
         (["from={log}", "to={log}/new"], 2, "lies in the log itself"),
-        (["from={log}", "to={out}", "layout=drivestudo"], 2, "no option 'drivestudo' in conf/layout: choose one of "),
-        (["from={log}", "to={out}", "layout=drivestudio", "layout=x"], 2, "written in one layout"),
-        (["from={log}", "to={out}", "layout.jpeg_qualty=9"], 2, "did you mean 'layout.jpeg_quality'?"),
+        (["from={log}", "to={out}", "layout=kitti"], 2, "no key 'layout'"),
+        (["from={log}", "to={out}", "flavor=kitti"], 2, "flavor must be "),
         (
-            ["from={log}", "to={out}", "layout.jpeg_quality=fine"],
+            ["from={log}", "to={out}", "jpeg_quality=fine"],
             2,
-            "layout.jpeg_quality must be int | None, got 'fine'",
+            "jpeg_quality must be int | None, got 'fine'",
         ),
-        (["from={log}", "to={out}", "layout.jpeg_quality=200"], 2, "jpeg_quality lies in 1 to 100, got 200"),
-        (["from={log}", "to={out}", "layout.jpeg_quality=1,2"], 2, "layout.jpeg_quality"),
+        (["from={log}", "to={out}", "jpeg_quality=200"], 2, "jpeg_quality lies in 1 to 100, got 200"),
+        (["from={log}", "to={out}", "jpeg_quality=1,2"], 2, "jpeg_quality"),
         (["from={log}", "to={out}", "data.log.last_frme=3"], 2, "no key 'data.log.last_frme'"),
         (["from={log}", "to={out}", "data.log.last_frame=30"], 1, "are not within the log's 0 to 2"),
         (["from={log}", "to={full}"], 1, "is no empty folder: name another place with to=..., or remove it"),
@@ -125,21 +119,3 @@ def test_a_wrong_command_is_answered_and_nothing_is_written(words, status, said,
     assert said in written
     assert written.startswith("sparsestreet data convert: ")
     assert set(tmp_path.rglob("*")) == before
-
-
-def test_every_setting_of_a_layout_is_a_key_with_its_own_default():
-    keys: Any = OmegaConf.load(CONF / "layout" / "drivestudio.yaml")
-    assert set(keys) == {"_target_"} | {field.name for field in fields(DriveStudioWriter)}
-    for field in fields(DriveStudioWriter):
-        assert field.default is not MISSING
-        assert keys[field.name] == field.default
-
-
-def test_a_layout_of_ones_own(tmp_path, capsys):
-    own = tmp_path / "conf"
-    (own / "layout").mkdir(parents=True)
-    (own / "layout/letters.yaml").write_text("_target_: tests.data.test_convert.Letters\nnames: [a, b]\n")
-    words = [f"from={make_nuscenes(tmp_path / 'log')}", f"to={tmp_path / 'out'}", f"hydra.searchpath=[file://{own}]"]
-    assert converted(*words, "layout=letters") == 0
-    assert (tmp_path / "out/b").read_text() == "b whole"
-    assert "lost or changed: 3 letters are lost" in capsys.readouterr().out

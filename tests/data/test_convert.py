@@ -11,10 +11,9 @@ from typing import NoReturn
 
 import pytest
 
-from sparsestreet.data.convert import DESCRIPTION, Show, Source, convert, partial_folder
+from sparsestreet.data.convert import DESCRIPTION, LogFile, LogWriter, Show, Source, convert, partial_folder
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.data.writer import LogFile, LogWriter
 from tests.data.streets import make_log
 
 SOURCE = Source("tiny", "0123456789ab", {"width": None})

@@ -5,12 +5,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from sparsestreet.data.fingerprint import LogFiles, hash_files
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
+from sparsestreet.data.roles import role_of
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
+
+CONF = Path(__file__).parents[2] / "conf"
+CLASSES = sorted(path.stem for path in (CONF / "data").glob("*.yaml"))
 
 
 @dataclass(frozen=True)
@@ -103,3 +108,12 @@ def test_a_street_is_its_settings_wherever_it_lies(tmp_path):
     assert street.data_hash() == replace(street, root=tmp_path / "b").data_hash()
     assert street.data_hash() != StreetReader(StreetSettings(seed=4), root=tmp_path / "a").data_hash()
     assert street.data_hash() != StreetReader(StreetSettings(seed=3, num_frames=7)).data_hash()
+
+
+@pytest.mark.parametrize("name", CLASSES)
+def test_names_mean_what_the_configuration_of_their_data_set_says(name):
+    classes = dict(OmegaConf.to_container(OmegaConf.load(CONF / "data" / f"{name}.yaml"))).get("classes")  # pyright: ignore
+    if not isinstance(classes, dict):
+        pytest.skip(f"data={name} has no classes of its own")
+    for role, names in classes.items():
+        assert {one: role_of(one) for one in names} == dict.fromkeys(names, role)

@@ -41,6 +41,13 @@ def test_cut_off_pixels_are_counted_and_the_worst_image_is_named():
     assert found.clipped_error == pytest.approx(0.15 / 10**0.5)  # nine images of 0, one of 0.5
 
 
+def test_a_lamp_of_one_color_is_not_cut_off():
+    red = [replace(frame, image=frame.image.clone()) for frame in frames(90)]
+    for frame in red:
+        frame.image[..., 0] = 255
+    assert measured_light(Frames.of(red)).clipped == 0
+
+
 def test_sky_and_car_do_not_count():
     top = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     top[:15] = True

@@ -13,11 +13,10 @@ from sparsestreet.data.drivestudio.annotations import (
     written_tracks,
 )
 from sparsestreet.data.drivestudio.classes import class_in
-from sparsestreet.data.drivestudio.placement import CAMERAS, Placement
+from sparsestreet.data.drivestudio.placement import CAMERAS, Placement, dataset_from_camera
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.mask_kinds import find_masks
 from sparsestreet.data.stamps import frame_stamps
-from sparsestreet.data.vehicle import dataset_from_camera
 
 _MOVED = 1e-4
 """Meters, and radians: what float32 poses and mounts are off by is less."""

@@ -12,9 +12,10 @@ from sparsestreet.data.drivestudio.classes import KNOWN
 from sparsestreet.data.drivestudio.flavors import FLAVORS, UPRIGHT, Flavor
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.motion import PosePath
+from sparsestreet.data.poses import AHEAD_FROM_OPENCV
 from sparsestreet.data.stamps import frame_stamps
-from sparsestreet.data.vehicle import AHEAD_FROM_OPENCV, dataset_from_camera
 from sparsestreet.geometry.transforms import inverse
+from sparsestreet.types import View
 
 WrittenFlavor = Literal["auto", "waymo", "nuscenes"]
 
@@ -58,9 +59,14 @@ def placed(log: DrivingLog, wanted: WrittenFlavor = "auto") -> Placement:
     if wanted == "auto":
         return _with_own_poses(log, seen)
     raise ValueError(
-        f"flavor waymo has cameras that are rigid on a vehicle, but {found}: say layout.flavor=nuscenes, which has a "
+        f"flavor waymo has cameras that are rigid on a vehicle, but {found}: say flavor=nuscenes, which has a "
         "pose for each image"
     )
+
+
+def dataset_from_camera(log: DrivingLog, view: View) -> Float64[Tensor, "4 4"]:
+    """Return the pose of an image with OpenCV's axes, in the data set's own world."""
+    return log.dataset_from_world @ inverse(view.camera.camera_from_world.double())
 
 
 def _is_waymo(log: DrivingLog) -> bool:

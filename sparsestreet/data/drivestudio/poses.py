@@ -10,11 +10,8 @@ from torch import Tensor
 from sparsestreet.data.clock import LogClock, read_stamps
 from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.numbers import read_numbers
-from sparsestreet.data.poses import check_rigid
+from sparsestreet.data.poses import AHEAD_FROM_OPENCV, check_rigid
 from sparsestreet.data.problems import fault
-
-# Waymo's cameras look along x, with y to the left and z up.
-WAYMO_FROM_OPENCV = torch.tensor([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 
 
 def read_pose(path: Path) -> Float64[Tensor, "4 4"]:
@@ -44,7 +41,7 @@ def world_from_camera(layout: Layout, frame: int, camera: int) -> Float64[Tensor
     pose = read_pose(layout.extrinsics(frame, camera))
     if layout.flavor.mounted:
         pose = read_pose(layout.sweep_pose(frame)) @ pose
-    return pose if layout.flavor.opencv else pose @ WAYMO_FROM_OPENCV
+    return pose if layout.flavor.opencv else pose @ AHEAD_FROM_OPENCV
 
 
 def first_pose(layout: Layout) -> Float64[Tensor, "4 4"]:

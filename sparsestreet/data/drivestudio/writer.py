@@ -10,16 +10,16 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from sparsestreet.data.convert import LogFile, LogWriter
 from sparsestreet.data.drivestudio.annotations import frame_instances, instances_info, people, written_tracks
 from sparsestreet.data.drivestudio.layout import EGO_MASKS, FINE_MASKS, SKY_MASKS, Layout
 from sparsestreet.data.drivestudio.losses import losses_of, unread_by_drivestudio
 from sparsestreet.data.drivestudio.placement import CAMERAS, Placement, WrittenFlavor, placed
-from sparsestreet.data.drivestudio.poses import WAYMO_FROM_OPENCV
 from sparsestreet.data.encoded import jpeg, mask_png, number_lines, png
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.mask_kinds import find_masks
+from sparsestreet.data.poses import AHEAD_FROM_OPENCV
 from sparsestreet.data.stamps import frame_stamps, seconds_lines
-from sparsestreet.data.writer import LogFile, LogWriter
 from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import View
 
@@ -78,7 +78,7 @@ class DriveStudioWriter(LogWriter):
     def notes(self, log: DrivingLog) -> tuple[str, ...]:
         where = placed(log, self.flavor)
         what = "a pose for each image" if where.mounts is None else "cameras that are rigid on a vehicle"
-        chosen = f"the flavor is {where.flavor.name}, which has {what}; layout.flavor names another"
+        chosen = f"the flavor is {where.flavor.name}, which has {what}; flavor=... names another"
         return (*([chosen] if self.flavor == "auto" else []), *unread_by_drivestudio(log, where, stand_ins(log, where)))
 
     def _image(self, log: DrivingLog, place: int) -> bytes:
@@ -137,7 +137,7 @@ def _poses(log: DrivingLog, layout: Layout, where: Placement) -> Iterator[LogFil
     numbers = [*enumerate(where.cameras), *((0, camera) for camera in stand_ins(log, where))]
     if where.mounts is not None:
         for index, camera in numbers:
-            yield _file(layout.extrinsics(0, camera), _pose, where.mounts[index] @ inverse(WAYMO_FROM_OPENCV))
+            yield _file(layout.extrinsics(0, camera), _pose, where.mounts[index] @ inverse(AHEAD_FROM_OPENCV))
     else:
         place = {view.indices: place for place, view in enumerate(log.views)}
         for frame in range(log.num_frames):

@@ -1,6 +1,5 @@
-"""KITTI's raw data as they are shipped: read and written."""
+"""KITTI's raw data as they are shipped."""
 
 from sparsestreet.data.kitti.reader import KittiReader
-from sparsestreet.data.kitti.writer import KittiWriter
 
-__all__ = ["KittiReader", "KittiWriter"]
+__all__ = ["KittiReader"]

@@ -18,8 +18,6 @@ FASTEST, FASTEST_TURN = 150.0, 20.0
 _LARGEST = 1 << 16
 _STEPS = 32
 """Straight parts of the arc of a sweep: at 10 m/s and 0.3 rad/s they miss it by 4 micrometers."""
-_STEEP = 1e-7
-"""Cosine of a pitch at which roll and yaw turn about one axis."""
 _REMEDY = "copy it again from the published archive, or read other frames (data.log.first_frame, .last_frame)"
 
 
@@ -86,44 +84,6 @@ def read_oxts(path: Path) -> Oxts:
             raise fault(path, f"the {what} {value:g} is beyond {most:g}, no car's", _REMEDY)
     rotation = _rotation(roll, pitch, yaw)
     return Oxts(latitude, longitude, altitude, rotation, rotation.T @ np.array([east, north, up]), values[17:20])
-
-
-def oxts_values(
-    latitude: float,
-    longitude: float,
-    pose: Float64[np.ndarray, "4 4"],
-    velocity: Float64[np.ndarray, "3"],
-    turn: Float64[np.ndarray, "3"],
-) -> Float64[np.ndarray, "30"]:
-    """The numbers of a frame's file; accelerations and accuracies, which nobody measured, are 0.
-
-    Args:
-        latitude: degrees.
-        longitude: degrees.
-        pose: world_from_imu; x east, y north, z up.
-        velocity: m/s, in the world.
-        turn: rad/s about the IMU's axes.
-    """
-    values, rotation = np.zeros(30), pose[:3, :3]
-    values[:3] = latitude, longitude, pose[2, 3]
-    values[3:6] = angles_of(rotation)
-    values[6:8], values[8:11] = velocity[[1, 0]], rotation.T @ velocity
-    values[10] = velocity[2]
-    values[17:20] = values[20:23] = turn
-    return values
-
-
-def angles_of(rotation: Float64[np.ndarray, "3 3"]) -> tuple[float, float, float]:
-    """Roll, pitch and yaw, radians, of Rz(yaw) Ry(pitch) Rx(roll); straight up or down the roll is 0."""
-    level = np.hypot(rotation[0, 0], rotation[1, 0])
-    if level < _STEEP:
-        steep = float(np.arctan2(-rotation[2, 0], level))
-        return 0.0, steep, float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
-    return (
-        float(np.arctan2(rotation[2, 1], rotation[2, 2])),
-        float(np.arctan2(-rotation[2, 0], level)),
-        float(np.arctan2(rotation[1, 0], rotation[0, 0])),
-    )
 
 
 def _rotation(roll: float, pitch: float, yaw: float) -> Float64[np.ndarray, "3 3"]:

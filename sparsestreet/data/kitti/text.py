@@ -2,7 +2,6 @@
 
 import calendar
 import re
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -66,30 +65,6 @@ def read_stamps(path: Path) -> list[int | None]:
     Lines are empty where a file was lost (drive 2011_09_26_0009). Raises LogError for lines that are no stamps.
     """
     return [_nanoseconds(line, path, number) if line else None for number, line in enumerate(read_lines(path), 1)]
-
-
-def stamp_text(stamp: int) -> str:
-    """The line of a stamp.
-
-    >>> stamp_text(1_316_993_500_000_000_007)
-    '2011-09-25 23:31:40.000000007'
-    """
-    seconds, fraction = divmod(stamp, 1_000_000_000)
-    return f"{time.strftime('%Y-%m-%d %H:%M:%S', time.gmtime(seconds))}.{fraction:09d}"
-
-
-def keyed_lines(table: Mapping[str, object]) -> bytes:
-    """Lines ``key: value``, of numbers with all of their digits."""
-    return "".join(f"{key}: {number_text(value)}\n" for key, value in table.items()).encode()
-
-
-def number_text(values: object) -> str:
-    """Numbers of a matrix row by row, or text as it is."""
-    return (
-        values
-        if isinstance(values, str)
-        else " ".join(repr(float(value)) for value in np.asarray(values, dtype=np.float64).ravel())
-    )
 
 
 def _nanoseconds(line: str, path: Path, number: int) -> int:

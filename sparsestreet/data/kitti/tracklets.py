@@ -1,6 +1,5 @@
 """Annotated objects of a drive from tracklet_labels.xml."""
 
-from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -10,20 +9,16 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from sparsestreet.data.kitti.oxts import angles_of
 from sparsestreet.data.kitti.text import numbers
 from sparsestreet.data.problems import LogError, Problem, fault
-from sparsestreet.data.roles import role_of
 from sparsestreet.data.safe_xml import elements
 
 _LARGEST = 1 << 25
 """Bytes; 15 objects of 100 frames take 0.3 MB."""
-_UNSET, _LABELED = 0, 2
-"""States of a pose: nobody gave it, or somebody drew it; 1 is interpolated."""
+_UNSET = 0
+"""State of a pose that nobody gave."""
 _FARTHEST = 1000.0
 """Meters."""
-TYPES = ("Car", "Van", "Truck", "Tram", "Cyclist", "Pedestrian", "Person (sitting)", "Misc")
-_OF_ROLES = {"vehicle": "Car", "cyclist": "Cyclist", "pedestrian": "Pedestrian", "other": "Misc"}
 _REMEDY = "copy it again from the published archive, or remove it to read the drive without boxes"
 
 
@@ -57,64 +52,6 @@ def read_tracklets(path: Path) -> list[Tracklet]:
     if problems:
         raise LogError(problems)
     return found
-
-
-def object_type(class_name: str) -> str:
-    """KITTI's type of a class of any data set.
-
-    >>> object_type("vehicle.car"), object_type("Tram"), object_type("animal")
-    ('Car', 'Tram', 'Misc')
-    """
-    return class_name if class_name in TYPES else _OF_ROLES[role_of(class_name)]
-
-
-def tracklets_text(objects: Sequence[str]) -> Iterator[bytes]:
-    """The file of some ``tracklet_text``."""
-    yield b'<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE boost_serialization>\n'
-    yield b'<boost_serialization signature="serialization::archive" version="9">\n<tracklets version="0">\n'
-    yield f"<count>{len(objects)}</count><item_version>1</item_version>\n".encode()
-    for one in objects:
-        yield one.encode()
-    yield b"</tracklets>\n</boost_serialization>\n"
-
-
-def tracklet_text(
-    class_name: str, size: Sequence[float], boxes: Mapping[int, Float64[np.ndarray, "4 4"]], what: str
-) -> str:
-    """One object of the file, with poses that nobody gave where it has none in between.
-
-    Args:
-        class_name: one of TYPES.
-        size: length, width, height, meters.
-        boxes: frame -> lidar_from_object, from the center.
-        what: the object, in an error.
-
-    Raises ValueError for a box that lies too far away.
-    """
-    length, width, height = size
-    first, last = min(boxes), max(boxes)
-    poses = "".join(
-        _pose_text(boxes.get(frame), height, f"{what} at frame {frame}") for frame in range(first, last + 1)
-    )
-    return (
-        f"<item><objectType>{class_name}</objectType><h>{height!r}</h><w>{width!r}</w><l>{length!r}</l>"
-        f"<first_frame>{first}</first_frame><poses><count>{last + 1 - first}</count><item_version>2</item_version>\n"
-        f"{poses}</poses><finished>1</finished></item>\n"
-    )
-
-
-def _pose_text(pose: Float64[np.ndarray, "4 4"] | None, height: float, what: str) -> str:
-    place, angles, state = np.zeros(3), (0.0, 0.0, 0.0), _UNSET
-    if pose is not None:
-        place, angles, state = pose[:3, 3] - 0.5 * height * pose[:3, 2], angles_of(pose[:3, :3]), _LABELED
-    if np.abs(place).max() > _FARTHEST:
-        raise ValueError(
-            f"{what} lies {np.abs(place).max():.0f} m from the lidar, and KITTI's readers refuse boxes beyond "
-            f"{_FARTHEST:.0f} m: leave the object out, or check the log's scale"
-        )
-    values = dict(zip(("tx", "ty", "tz", "rx", "ry", "rz"), (*place.tolist(), *angles), strict=True))
-    fields = "".join(f"<{key}>{value!r}</{key}>" for key, value in values.items())
-    return f"<item>{fields}<state>{state}</state><occlusion>-1</occlusion><truncation>-1</truncation></item>\n"
 
 
 def _tracklet(item: Element, path: Path, what: str) -> Tracklet:

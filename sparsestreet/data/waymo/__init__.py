@@ -9,12 +9,8 @@ boxes     boxes at their instants
 pixels    images, and masks from panoptic labels
 spool     what was decoded once, in a temporary file
 reader    the recording
-
-log_segment, log_boxes, range_grid    a log in these values, which v1.writer and v2.writer write
 """
 
 from sparsestreet.data.waymo.reader import WaymoReader
-from sparsestreet.data.waymo.v1.writer import WaymoV1Writer
-from sparsestreet.data.waymo.v2.writer import WaymoV2Writer
 
-__all__ = ["WaymoReader", "WaymoV1Writer", "WaymoV2Writer"]
+__all__ = ["WaymoReader"]

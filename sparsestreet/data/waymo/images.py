@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.vehicle import AHEAD_FROM_OPENCV
+from sparsestreet.data.poses import AHEAD_FROM_OPENCV
 from sparsestreet.data.waymo.segment import CameraCalibration, ImageMotion
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import Shutter

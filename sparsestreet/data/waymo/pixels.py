@@ -1,7 +1,6 @@
 """Images and masks from the bytes of PNG and JPEG files that stand in other files."""
 
 import io
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -16,10 +15,6 @@ from sparsestreet.data.waymo.segment import REMEDY
 
 _KINDS = {"sky": (25,), "human": (6, 7, 9, 10, 11), "vehicle": (2, 3, 4, 5, 8)}
 """Of Waymo's 28 classes: bicycles and motorcycles count as human, as in DriveStudio's masks."""
-WRITTEN = {"ego": 1, "sky": 25, "human": 9, "vehicle": 2}
-"""Class of each kind of mask when it is written: the recording car, sky, pedestrian, car. Later kinds win."""
-DIVISOR = 1000
-"""Of the labels that are written, and of Waymo's."""
 
 
 def decode_image(
@@ -48,21 +43,6 @@ def decode_masks(
             mask = np.array(Image.fromarray(mask).resize(size, way))
         masks[kind] = torch.from_numpy(mask > 0)
     return masks
-
-
-def encode_masks(masks: Mapping[str, Bool[Tensor, "h w"] | None], ego: Bool[Tensor, "h w"] | None) -> bytes | None:
-    """A PNG of class * DIVISOR; None where none of the masks that a reader finds is given. It passes over ``ego``."""
-    given = {kind: mask for kind, mask in masks.items() if mask is not None}
-    if not given:
-        return None
-    classes = torch.zeros_like(next(iter(given.values())), dtype=torch.int32)
-    for kind, number in WRITTEN.items():
-        mask = ego if kind == "ego" else given.get(kind)
-        if mask is not None:
-            classes[mask] = number
-    file = io.BytesIO()
-    Image.fromarray((classes.numpy() * DIVISOR).astype(np.uint16)).save(file, "PNG")
-    return file.getvalue()
 
 
 def _opened(data: bytes, recorded: tuple[int, int], path: Path, what: str, mode: str | None) -> Image.Image:

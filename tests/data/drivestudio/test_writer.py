@@ -133,7 +133,7 @@ def test_what_is_not_of_waymo_gets_a_pose_for_each_image(change, said, tmp_path)
     if said is None:
         assert "ego_pose/000.txt" in {file.path for file in forced.files(log)}
         return
-    with pytest.raises(ValueError, match=said + ": say layout.flavor=nuscenes"):
+    with pytest.raises(ValueError, match=said + ": say flavor=nuscenes"):
         list(forced.files(log))
 
 
@@ -149,7 +149,7 @@ def test_what_drivestudio_itself_needs_a_change_for_is_said(everything):
     assert "cameras 2, 3, 4, 5 too" in stand_ins
     bare = replace(make_log(), tracks=())
     chosen, _, absent = LOSSLESS.notes(bare)
-    assert chosen == "the flavor is nuscenes, which has a pose for each image; layout.flavor names another"
+    assert chosen == "the flavor is nuscenes, which has a pose for each image; flavor=... names another"
     assert absent == (
         "DriveStudio asks for what is not there, unless data.pixel_source says so: lidar, without which it does not "
         "start, boxes (load_objects=false), bodies (load_smpl=false), human and vehicle masks (load_dynamic_mask=false)"

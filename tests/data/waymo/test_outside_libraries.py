@@ -5,14 +5,9 @@ They need packages that they do not import here: install them with --no-deps, an
 
 import numpy as np
 import pytest
-import torch
 
 from sparsestreet.data.waymo import WaymoReader
-from sparsestreet.data.waymo.v1.records import Records
 from sparsestreet.data.waymo.v1.segment import RecordSegment
-from sparsestreet.data.waymo.v1.writer import WaymoV1Writer
-from sparsestreet.data.waymo.v2.writer import WaymoV2Writer
-from tests.data.round_trip import written
 from tests.data.waymo import records, tables
 from tests.data.waymo.drive import Drive
 from tests.data.waymo.records import NAME
@@ -59,59 +54,6 @@ def test_waymo_own_messages_say_the_same(packed, drive, tmp_path):
         *(theirs.length, theirs.width, theirs.height, theirs.heading),
     )
     assert (box.name, box.kind, box.seen_by) == (label.id, label.type, label.most_visible_camera_name)
-
-
-def test_a_written_log_has_no_field_that_waymo_own_messages_lack(roots, tmp_path):
-    """Theirs drop what they do not know, and fields of another type; ours reads what is left as it read all."""
-    messages = pytest.importorskip(
-        "waymo_open_dataset.dataset_pb2", reason="waymo-open-dataset-tf-2-12-0 is not installed"
-    )
-    log = WaymoReader(root=roots[1]).read()
-    (path,) = written(WaymoV1Writer(jpeg_quality=None, rows=16, columns=64), log, tmp_path / "own").glob("*.tfrecord")
-    segment, parsed = Records(path), []
-    for number in range(len(segment)):
-        frame = messages.Frame()
-        frame.ParseFromString(bytes(segment[number]))
-        size = frame.ByteSize()
-        frame.DiscardUnknownFields()
-        assert frame.ByteSize() == size
-        assert [len(frame.images), len(frame.lasers), len(frame.laser_labels)] == [2, 1, 1]
-        parsed.append(frame.SerializeToString())
-    records.write(tmp_path / "theirs" / path.name, parsed)
-    own, theirs = (WaymoReader(root=tmp_path / name).recording() for name in ("own", "theirs"))
-    for one, other in zip(own.shots, theirs.shots, strict=True):
-        assert torch.equal(one.world_from_camera, other.world_from_camera)
-    assert np.array_equal(there(own.sweeps)[3].read(), there(theirs.sweeps)[3].read())
-    assert np.array_equal(there(own.boxes)[0].poses, there(theirs.boxes)[0].poses)
-
-
-def test_tri3d_finds_a_written_log_where_we_do(tmp_path):
-    waymo = pytest.importorskip("tri3d.datasets.waymo", reason="tri3d, numba or llvmlite is not installed")
-    arrow = pytest.importorskip("pyarrow.parquet", reason="version 2 needs pyarrow")
-    # tri3d asks for stamps that survive its arithmetic.
-    records.write_drive(tmp_path / "drive", Drive(start=1_532_402_928_000_000_000))
-    log = WaymoReader(root=tmp_path / "drive").read()
-    root = written(WaymoV2Writer(jpeg_quality=None, rows=64, columns=512), log, tmp_path / "own" / "training")
-    for component in ("camera_box", "lidar_segmentation"):
-        tables.write(root / component / f"{NAME}.parquet", "Component", [{SEGMENT: NAME, FRAME: 0, LASER: 1}])
-    path = root / "lidar_box" / f"{NAME}.parquet"
-    table, component = arrow.read_table(path), "[LiDARBoxComponent]."
-    for name in [f"{kind}.{axis}" for kind in ("speed", "acceleration") for axis in "xyz"]:
-        table = table.append_column(component + name, [[0.0] * len(table)])
-    counts = ("num_lidar_points_in_box", "num_top_lidar_points_in_box")
-    for name in (*counts, "difficulty_level.detection", "difficulty_level.tracking"):
-        table = table.append_column(component + name, [[1] * len(table)])
-    arrow.write_table(table, path)
-    theirs, ours = waymo.Waymo(tmp_path / "own", "training"), WaymoReader(root=tmp_path / "own").recording()
-    segment = WaymoV2Writer().segment(log)
-    for frame in range(4):
-        pose = segment.world_from_vehicle(frame).numpy()
-        world = theirs._points(0, frame, "LIDAR_TOP") @ pose[:3, :3].T + pose[:3, 3]
-        found = there(ours.sweeps)[frame].read()[: len(world)]
-        # Theirs are float32 in the vehicle's frame, after poses of 4 km in float32, turned by float32 angles: 9 mm.
-        np.testing.assert_allclose(found, world, atol=2e-2)
-        shots = [shot for shot in ours.shots if (shot.frame, shot.camera) == (frame, 0)]
-        assert np.array_equal(theirs.image(0, frame, "IMG_FRONT"), ours.read_image(shots[0]))
 
 
 def test_tri3d_finds_the_same_points_boxes_and_images(tmp_path):

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from sparsestreet.data.convert import Source, convert
+from sparsestreet.data.drivestudio import DriveStudioWriter
 from sparsestreet.data.waymo import WaymoReader
 from sparsestreet.geometry import quaternions as quat
+from tests.conftest import unchecked
 from tests.data.plan import moved
 from tests.data.waymo import records
 from tests.data.waymo.drive import EXPOSURE, HALF_SPIN, LENS, READOUT, Drive
@@ -176,3 +179,21 @@ def test_a_sound_drive_has_no_problems_and_a_hash(root):
     reader = WaymoReader(root=root)
     assert reader.check() == []
     assert reader.data_hash() == WaymoReader(root=root).data_hash()
+
+
+def test_a_segment_becomes_drivestudios_flavor_of_waymo(roots, drive, tmp_path):
+    """As its own preprocessing writes it: the vehicle's pose of the frame, and the calibrated mounts."""
+    with unchecked():
+        log = WaymoReader(root=roots[1]).read()
+        convert(log, Source(log.name, "0" * 12), DriveStudioWriter(), tmp_path / "out")
+    assert log.vehicle is not None
+    poses = log.dataset_from_world @ log.vehicle.poses
+    for frame in range(log.num_frames):
+        found = np.loadtxt(tmp_path / f"out/ego_pose/{frame:03d}.txt")
+        np.testing.assert_allclose(found, poses[frame].numpy(), rtol=0, atol=1e-6)
+    for number, camera in enumerate(drive.cameras[:2]):
+        mount = np.loadtxt(tmp_path / f"out/extrinsics/{number}.txt")
+        # x ahead, as Waymo's cameras have it; the path is a chord of the curve between two frames.
+        right = camera.vehicle_from_camera @ np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+        np.testing.assert_allclose(mount, right, rtol=0, atol=0.01)
+    assert np.fromfile(tmp_path / "out/lidar/000.bin", np.float32).size % 14 == 0
