@@ -41,6 +41,14 @@ def test_cut_off_pixels_are_counted_and_the_worst_image_is_named():
     assert found.clipped_error == pytest.approx(0.15 / 10**0.5)  # nine images of 0, one of 0.5
 
 
+def test_a_saturated_color_is_not_cut_off():
+    """A red lamp has one channel at the end of its range, and the others say what it looks like."""
+    red = [replace(frame, image=frame.image.clone()) for frame in frames(90)]
+    for frame in red:
+        frame.image[:10, :, 0] = 255
+    assert measured_light(Frames.of(red)).clipped == 0
+
+
 def test_sky_and_car_do_not_count():
     top = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     top[:15] = True
