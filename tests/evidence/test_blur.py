@@ -40,6 +40,22 @@ def test_motion_is_that_between_the_images_around():
     assert motions[0, 0].translation.norm() == pytest.approx(0.08, rel=1e-3)
 
 
+def test_motion_is_the_same_however_the_world_is_turned():
+    """Motions are in the camera's axes, so a world whose z is up, far from its origin, changes none of them."""
+    straight = [on_a_circle(frame) for frame in range(3)]
+    world = torch.eye(4)
+    world[:3, :3] = torch.tensor([[0.0, 0.8, 0.6], [0.0, -0.6, 0.8], [1.0, 0.0, 0.0]])
+    world[:3, 3] = torch.tensor([3.0, -20.0, 7.0])
+    turned = [replace(one, camera=replace(one.camera, camera_from_world=one.camera.camera_from_world @ world))
+              for one in straight]  # fmt: skip
+    expected, found = exposure_motions(straight), exposure_motions(turned)
+    assert expected.keys() == found.keys()
+    for indices, motion in expected.items():
+        # A millionth of the world's 20 m, and of a turn, in float32 poses.
+        torch.testing.assert_close(found[indices].translation, motion.translation, rtol=0, atol=2e-5)
+        torch.testing.assert_close(found[indices].rotation, motion.rotation, rtol=0, atol=1e-6)
+
+
 def test_a_declared_readout_says_it_too():
     shutter = Shutter(torch.tensor([0.3, 0.0, 0.0]), torch.tensor([0.0, 0.02, 0.0]), "left", seconds=0.03, span=0.06)
     lone = view(0, replace(CAMERA, shutter=shutter))

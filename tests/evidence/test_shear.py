@@ -45,6 +45,13 @@ def test_without_lidar_points_are_ten_meters_away():
     assert readout_shear([view(shutter(0.3, 0.0, 0.0))], Sweeps.of(())).pixels == pytest.approx(3.0, rel=1e-3)
 
 
+def test_a_view_is_measured_at_the_sweep_of_its_frame():
+    """Frames have gaps: the second sweep is that of frame 5, four times as near as that of frame 0."""
+    sweeps = Sweeps.of((sweep((0.0, 0.0, 10.0)), sweep((0.0, 0.0, 2.5), index=5)))
+    assert readout_shear([view(shutter(0.3, 0.0, 0.0), 5)], sweeps).pixels == pytest.approx(12.0, rel=1e-3)
+    assert readout_shear([view(shutter(0.3, 0.0, 0.0), 0)], sweeps).pixels == pytest.approx(3.0, rel=1e-3)
+
+
 def test_the_error_is_that_of_the_mean_over_views():
     views = [view(shutter(0.2 + 0.1 * frame, 0.0, 0.0), frame) for frame in range(3)]
     sweeps = Sweeps.of(tuple(sweep((0.0, 0.0, 10.0), index=frame) for frame in range(3)))

@@ -135,6 +135,20 @@ def test_what_the_recording_car_hides_costs_nothing():
     assert both == alone > 0
 
 
+def test_a_vehicle_on_the_recording_car_costs_what_it_does_without_one():
+    """A vehicle mirrored on the hood: the vehicle region is what is marked outside of the recording car."""
+    scene = scene_of([0.5], [2.0])
+    hood, vehicle = torch.zeros(7, 9, dtype=torch.bool), torch.zeros(7, 9, dtype=torch.bool)
+    hood[5:], vehicle[2:] = True, True
+    frame = frame_of(scene, 20)
+    rule = LeaveOneOutRule(0.0, noticeable=0.0)
+    over, beside = (
+        rule.costs(scene, [replace(frame, ego=hood, vehicle=mask)], CONTEXT)["background"]
+        for mask in (vehicle, vehicle & ~hood)
+    )
+    assert torch.equal(over, beside)
+
+
 def _selection(scene: SceneGraph, frame: Frame, rule: PruningRule) -> Selection:
     return rule.select(scene, [frame], CONTEXT)["background"]
 

@@ -86,6 +86,22 @@ def test_the_drive_is_that_of_the_rig(archive, street):
     assert drive["rig_bbox"]["centroid"] == pytest.approx([1.4, 0.0, 0.8])
 
 
+def test_the_map_is_where_the_scene_is(street, tmp_path):
+    """A point of a data set far from its origin goes to its place in the scene; images last as long as readouts."""
+    served, views = apart(5, 10.0, True, 0.03)
+    dataset_from_world = np.array([[0.0, -1, 0, 1000], [1, 0, 0, 2000], [0, 0, 1, 30], [0, 0, 0, 1]])
+    moved = replace(served, rig=replace(served.rig, dataset_from_world=dataset_from_world))
+    write_artifact(tmp_path / "a.usdz", moved, views, FROM)
+    with zipfile.ZipFile(tmp_path / "a.usdz") as found:
+        said = json.loads(found.read("rig_trajectories.json"))
+    # Five meters along x of the scene is along y of the data set.
+    assert np.allclose(said["world_to_nre"]["matrix"] @ np.array([1000, 2005, 30, 1]), [5, 0, 0, 1])
+    (drive,) = said["rig_trajectories"]
+    for frames in drive["cameras_frame_timestamps_us"].values():
+        assert [end - start for start, end in frames[1:]] == [30_000] * len(frames[1:])
+        assert len(frames) > 1
+
+
 def test_a_track_sent_back_leaves_its_object_where_it_is(archive, street):
     with zipfile.ZipFile(archive) as found:
         tracks = json.loads(found.read("sequence_tracks.json"))["street"]

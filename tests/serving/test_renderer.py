@@ -84,6 +84,13 @@ def test_a_moved_object_stands_where_it_was_put_also_after_its_recorded_life(str
     assert np.abs(shown(street, request_for(view)).astype(int) - expected).max() > 20
 
 
+def test_a_global_shutter_sees_the_street_of_the_start_of_its_frame(street):
+    """Also where the frame lasts: its camera stands where it is at the start."""
+    request = request_for(timed_views()[4])
+    request.frame_end_us = request.frame_start_us + 100_000
+    assert view_of(request, street.rig).time == street.rig.clock.time(request.frame_start_us)
+
+
 def test_rows_of_a_turning_car_are_what_each_of_them_saw(street):
     """Against 32 pictures, one a row, of a camera and a car that move straight and turn evenly meanwhile."""
     view = timed_views()[4]

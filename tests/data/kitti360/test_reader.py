@@ -112,6 +112,17 @@ def test_objects_that_stand_are_there_while_the_car_is_near(tmp_path):
     assert read_boxes(path, frames[4:], positions[4:]) == []
 
 
+def test_an_object_annotated_in_two_stretches_is_there_in_both(tmp_path):
+    first = cuboid(1, 13, 8, -1, PARKED, PARKED_SIZE)
+    second = cuboid(2, 13, 8, -1, PARKED, PARKED_SIZE)
+    second = second.replace("<start_frame>0<", "<start_frame>600<").replace("<end_frame>200<", "<end_frame>800<")
+    path = tmp_path / "boxes.xml"
+    path.write_text(f"<opencv_storage>{first}{second}</opencv_storage>")
+    frames = np.array([0, 700])
+    (boxes,) = read_boxes(path, frames, np.repeat(PARKED[None, :3, 3], 2, 0))
+    assert frames[boxes.frames].tolist() == [0, 700]
+
+
 def test_labels_give_masks_on_the_images_that_have_them(log):
     first, right, *_ = log.frames
     assert first.sky[:10].all()

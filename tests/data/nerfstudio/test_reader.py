@@ -141,6 +141,15 @@ def test_a_field_of_view_tells_the_focal_length(written):
     torch.testing.assert_close(view.camera.intrinsics, expected, rtol=1e-6, atol=0)
 
 
+def test_each_field_of_view_goes_with_its_own_side(written):
+    """The images are wider than high: 32 by 24 pixels."""
+    folder, content = written
+    angles = {"camera_angle_x": math.pi / 2, "camera_angle_y": math.pi / 3}
+    write_json(folder, at_the_top(content, **angles) | {"w": None, "h": None})
+    intrinsics = NerfstudioReader(root=folder).read().views[0].camera.intrinsics
+    assert (intrinsics[0, 0], intrinsics[1, 1]) == (pytest.approx(16), pytest.approx(12 * math.sqrt(3)))
+
+
 def test_a_frames_own_numbers_come_before_those_of_all(written):
     folder, content = written
     content |= {"fl_x": 99.0, "w": 7, "camera_model": "OPENCV_FISHEYE", "k1": 0.5}

@@ -2,12 +2,15 @@
 
 import logging
 import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
 from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
+from sparsestreet.training.callbacks.checkpoints import step_of
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from tests.training.stubs import StubTrainer, background, make_system
 
@@ -80,6 +83,30 @@ def test_half_a_step_and_no_step_leave_no_checkpoint(tmp_path, step, exception):
     trainer.walk(step)
     trainer.callbacks[0].on_exception(trainer, trainer.system, exception)
     assert "interrupted.ckpt" not in contents(tmp_path)
+
+
+def test_what_fails_inside_a_step_leaves_no_checkpoint(tmp_path):
+    """Some parameters may have moved and others not."""
+    trainer = trainer_in(tmp_path)
+    trainer.walk(3)
+    trainer.callbacks[0].on_train_batch_start(trainer, trainer.system, None, 3)
+    trainer.callbacks[0].on_exception(trainer, trainer.system, RuntimeError("no memory"))
+    assert contents(tmp_path) == {"last.ckpt": "2"}
+
+
+def test_a_flipped_bit_in_a_tensor_is_found(tmp_path):
+    """torch reads tensors without a look at their checksums."""
+    path = tmp_path / "last.ckpt"
+    torch.save({"global_step": 7, "rows": torch.full((4,), 0.5)}, path)
+    assert step_of(path) == 7
+    with zipfile.ZipFile(path) as archive:
+        (name,) = (entry for entry in archive.namelist() if entry.endswith("data/0"))
+        values = archive.read(name)
+    content = bytearray(path.read_bytes())
+    content[content.index(values)] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"checksum of .*data/0 is wrong"):
+        step_of(path)
 
 
 def test_a_full_disk_stops_no_training_but_is_an_error_at_the_end(tmp_path, caplog):

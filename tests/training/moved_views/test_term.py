@@ -134,6 +134,21 @@ def test_what_a_view_is_compared_with(monkeypatch):
     assert (view.time, view.indices, view.seconds, view.stamp) == (frame.time, frame.indices, 3.5, 7)
 
 
+def test_cameras_of_a_frame_see_their_own_returns(monkeypatch):
+    """The second camera of a frame looks backwards: what is near it is not what is near the first."""
+    points = torch.tensor([[0.0, 0.0, 9.0], [0.0, 0.0, -9.0], [0.5, 0.0, -8.0]])
+    returns = StreetReturns(Returns(points, torch.zeros(3, 3), torch.ones(3)), (0,), (0, 3), {}, ())
+    asked = []
+    monkeypatch.setattr(term_module, "target", lambda *given: asked.append(given[1]) or target(*given))
+    one, front = scene(), frame_at(0, WIDTH, HEIGHT)
+    backwards = front.camera.camera_from_world @ torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    rear = replace(front, camera=replace(front.camera, camera_from_world=backwards), camera_index=1)
+    term = MovedViewTerm(MovedViews(), returns, seed=7)
+    for frame in (front, rear, front):
+        term(one, seen(one, frame), frame)
+    assert [each.points[:, 2].tolist() for each in asked] == [[9.0], [-9.0, -8.0], [9.0]]
+
+
 def test_floaters_before_the_camera_are_left_to_the_recorded_views():
     """Rendered depths up to 0.5 m count nothing: the inverse would know nothing else."""
     one, frame = scene(), frame_at(0, WIDTH, HEIGHT)
