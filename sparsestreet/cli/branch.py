@@ -31,7 +31,6 @@ OF_PRUNING = (
     "sparsify.name",
     "sparsify.label",
     "sparsify.control",
-    "sparsify.published",
     # Floors and rights that pruning alone asks for.
     "node.*.min_instance_gaussians",
     "node.*.prunable",

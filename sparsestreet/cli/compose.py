@@ -19,12 +19,9 @@ from yaml import YAMLError
 
 import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
 from sparsestreet.cli.limits import limit_problem
+from sparsestreet.cli.option_files import CONF, config_files, option_tree, options_of
 from sparsestreet.naming import nearest
 from sparsestreet.safe_yaml import read_yaml
-
-PACKAGE = Path(__file__).resolve().parents[1]
-# An installed wheel carries conf/ inside the package; a checkout has it beside the package.
-CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
 
 WORDS = {
     **dict.fromkeys(("steps", "iterations", "iters", "num_iterations", "epochs"), "schedule.max_steps"),
@@ -57,7 +54,7 @@ class TrainSchema:
 
     name: str = MISSING
     seed: Any = MISSING
-    capacity: str = MISSING
+    capacity: Tree = MISSING
     split: Tree = MISSING
     training_views: Tree = MISSING
     budget: Tree = MISSING
@@ -220,8 +217,8 @@ def _masks_that_are_off(overrides: list[str], cfg: DictConfig) -> str | None:
 
 
 def _sparsify_with_masks() -> str:
-    names = _options("sparsify")
-    *some, last = [name for name in names if OmegaConf.load(CONF / "sparsify" / f"{name}.yaml").sparsify.get("masks")]
+    names = options_of("sparsify")
+    *some, last = [name for name in names if option_tree("sparsify", name)["sparsify"].get("masks")]
     return f"sparsify={', '.join(some)} or {last}"
 
 
@@ -246,7 +243,7 @@ def _explain(reason: str, overrides: list[str]) -> str:
     key = next((name for name in given if part in name.split(".") or name == part), part)
     if places := re.search(r"Did you mean to override (?:one of )?(.+)\?", reason):
         return f"no key {key!r}; did you mean {places[1].replace(', ', ' or ')}?{_options_of(key)}"
-    if key in _known()[0] or (CONF / _group(key)).is_dir():
+    if key in _known()[0] or options_of(_group(key)):
         return f"no key {key!r} with these choices: leave it out, or choose the option that has it"
     return _unknown_key(key, overrides)
 
@@ -272,18 +269,14 @@ def _no_option(name: str, group: str) -> str:
     if group == "hydra/launcher":
         package = name.partition("_")[0]
         return f"no launcher {name!r} is installed: pip install hydra-{package}-launcher, or leave it out"
-    while not _options(group) and "/" in group:
+    while not options_of(group) and "/" in group:
         group, name = group.rpartition("/")[0], f"{group.rpartition('/')[2]}/{name}"
-    return f"no option {name!r} in conf/{group}: choose one of {', '.join(_options(group))}"
+    return f"no option {name!r} in conf/{group}: choose one of {', '.join(options_of(group))}"
 
 
 def _needs_a_key(key: str) -> str:
     names = [f"{key}.{name}" for name in composed(())[key] if not name.startswith("_")]
     return f"{key} is no choice but has keys of its own: set one of {', '.join(names)}"
-
-
-def _options(group: str) -> list[str]:
-    return sorted(path.stem for path in (CONF / group).glob("*.yaml"))
 
 
 def _group(key: str) -> str:
@@ -334,7 +327,7 @@ def _by_last_name(word: str, known: Sequence[str]) -> list[str]:
 
 
 def _options_of(key: str) -> str:
-    options = _options(_group(key))
+    options = options_of(_group(key))
     return f" Its options are {', '.join(options)}" if options else ""
 
 
@@ -346,7 +339,7 @@ def _known() -> tuple[tuple[str, ...], dict[str, str]]:
     """
     with configuration():
         cfg = compose("train", return_hydra_config=True)
-    groups = [str(path.relative_to(CONF)) for path in CONF.rglob("*") if path.is_dir()]
+    groups = dict.fromkeys(group for place, _, _ in config_files() if (group := place.rpartition("/")[0]))
     places = [key for key in cfg.hydra.runtime.choices if "@" in key]
     values = _keys(OmegaConf.to_container(composed(()), resolve=False))
     follows = {key: re.fullmatch(r"\$\{([\w.]+)\}", str(value)) for key, value in values.items()}

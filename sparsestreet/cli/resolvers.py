@@ -22,23 +22,6 @@ PRESSED_STEPS = 2000
 """Steps that the weight of masks in ``schedule=short`` is made for (docs/length.md)."""
 
 
-def by_capacity(values: Mapping[str, Any], *, _root_: DictConfig) -> Any:
-    """Of conf/node: the entry of the capacity that is chosen."""
-    if _root_.capacity not in values:
-        raise ValueError(f"no capacity {_root_.capacity!r}: choose one of {', '.join(values)}")
-    return values[_root_.capacity]
-
-
-def as_published(published: Any, otherwise: Any, *, _root_: DictConfig) -> Any:
-    """Of conf/node and conf/mask: the paper's value if the sparsification says ``published``, else the other."""
-    return published if _root_.sparsify.get("published", False) else otherwise
-
-
-def limit(most: int | None, *, _root_: DictConfig) -> int | None:
-    """Of conf/node: the most Gaussians of a node, or none (null) if the sparsification says ``unlimited``."""
-    return None if _root_.sparsify.get("unlimited", False) else most
-
-
 def concat(*lists: Iterable[Any]) -> ListConfig:
     """Of conf/assignment: all lists as one."""
     return ListConfig([entry for entries in lists for entry in entries])  # ``--resolve`` takes no list of Python's
@@ -87,8 +70,8 @@ def relative_length(*, _root_: DictConfig) -> float:
 
 
 def gaussians_of_log(least: int, *, _root_: DictConfig) -> int:
-    """Of conf/node: a number of Gaussians, in whole hundreds, that grows with the training images where these are more
-    than ``data.images_per_capacity`` (without such a key ``IMAGES_PER_CAPACITY``); before the log is read, the least.
+    """Return a number of Gaussians, in whole hundreds, that grows with the training images where these are more than
+    ``data.images_per_capacity`` (without such a key ``IMAGES_PER_CAPACITY``). Before the log is read: the least.
     """
     return max(least, 100 * round(least * _relative_images(_root_) / 100))
 
@@ -108,7 +91,7 @@ def of_30000(step: int) -> float:
 
 def at_scale(label: str, *, _root_: DictConfig) -> str:
     """Of conf/preset: a label, which says so where a run is not as long and large as DriveStudio's."""
-    whole = _root_.capacity == "paper" and _root_.schedule.max_steps == 30_000
+    whole = _root_.capacity.name == "paper" and _root_.schedule.max_steps == 30_000
     return label if whole else f"{label}_scaled"
 
 
@@ -204,9 +187,6 @@ def swept(overrides: Iterable[str], fixed: Iterable[str]) -> str:
 
 _RESOLVERS = {
     "swept": swept,
-    "by_capacity": by_capacity,
-    "as_published": as_published,
-    "limit": limit,
     "concat": concat,
     "beside": beside,
     "mul": mul,

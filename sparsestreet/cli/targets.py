@@ -14,13 +14,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import yaml
 from hydra._internal.utils import _locate  # ``hydra.utils.get_object`` logs what it raises
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.compose import CONF, TrainSchema, load_run_config
+from sparsestreet.cli.compose import TrainSchema, load_run_config
+from sparsestreet.cli.option_files import CONF, config_files
 
 Place = tuple[str, ...]
 """Keys from the root of a configuration to a value; items of lists by their numbers."""
@@ -31,7 +31,6 @@ _RESERVED = ("_args_", "_partial_", "_convert_", "_recursive_")
 _FIXED = (("folder", None), ("logger", None), ("callback", "path"))
 """Root and last key of what decides where a run writes and whom it calls; None: all keys."""
 _ROOTS = {entry.name for entry in fields(TrainSchema)}
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 @dataclass(frozen=True)
@@ -52,11 +51,10 @@ def named_by_conf() -> ClosedList:
     """Returns the closed list. It leaves out ``hydra``, which is no part of a run."""
     targets: dict[str, set[str]] = {}
     values, texts = set(), set()
-    for path in sorted(CONF.rglob("*.yaml")):
-        text = path.read_text(encoding="utf-8")
-        group = path.relative_to(CONF).parts[0]
-        root = () if path.parent == CONF or text.startswith("# @package _global_") else (group,)
-        for place, value in leaves(yaml.load(text, _LOADER) or {}, root):
+    for name, anywhere, tree in config_files():
+        group = name.partition("/")[0]
+        root = () if anywhere or name == group else (group,)
+        for place, value in leaves(tree, root):
             if place[0] in ("hydra", "defaults"):
                 continue
             if place[-1] == TARGET:
@@ -64,7 +62,9 @@ def named_by_conf() -> ClosedList:
             if isinstance(value, str) and "${" in value:
                 texts.add(value)
             values.add((place, repr(value)))
-        for name in re.findall(r"#.*_target_: ([\w.]+)", text):  # a choice that a comment offers
+    for path in CONF.rglob("*.yaml"):
+        for name in re.findall(r"#.*_target_: ([\w.]+)", path.read_text(encoding="utf-8")):  # offered in a comment
+            group = path.relative_to(CONF).parts[0]
             targets.setdefault(name, set()).add(group if group in _ROOTS else "")
     rooted = {name: frozenset() if "" in roots else frozenset(roots) for name, roots in targets.items()}
     resolvers = {name for text in texts for name in re.findall(r"\$\{([\w.]+):", text)}

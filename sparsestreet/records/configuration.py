@@ -26,6 +26,7 @@ IDENTITY_KEYS = (
     "branch_points",
     "out",
     "folder",
+    "capacity.*",  # its numbers are compared where they act
     "count_of",  # the run whose counts a control copies; the counts are options of their own
     "data.root",  # where a log lies; the scene's name identifies it
     "data.log.root",
