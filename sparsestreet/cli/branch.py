@@ -1,24 +1,20 @@
-"""A run begins with the checkpoint of one that differs only in what it prunes from there on: a branch of its trunk.
+"""A run begins with a checkpoint of one that differs only in what it prunes from there on, which ``trunk`` names.
 
 All steps before the first pruning are the same steps, so a branch ends with the bits of a run that began at step 0.
 """
 
 import logging
 import math
-import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from sparsestreet.cli.compose import load_run_config, resolved
-from sparsestreet.cli.folder import configuration_of, identity_of_run, is_whole, lies_in
+from sparsestreet.cli.folder import configuration_of, identity_of_run, is_whole
 from sparsestreet.cli.resume import run_of
-from sparsestreet.records.branch_of import BRANCH_OF, BranchOf, moment_of
+from sparsestreet.naming import checkpoint_fraction
 from sparsestreet.records.configuration import IDENTITY_KEYS, Configuration, flat_config, without
 
 log = logging.getLogger(__name__)
@@ -73,7 +69,7 @@ def check_resumed(config: dict[str, Any], start: Path) -> None:
 
     From a checkpoint that was kept before a moment, another folder may prune otherwise from there on.
     """
-    run, moment = run_of(start), moment_of(start)
+    run, moment = run_of(start), checkpoint_fraction(start)
     before, now = flat_config(resolved(load_run_config(run))), flat_config(config)
     old, new = (without(flat, (*IDENTITY_KEYS, "trainer.*")) for flat in (before, now))
     elsewhere = Path(str(now.get("out"))).resolve() != run.resolve()
@@ -88,41 +84,23 @@ def check_resumed(config: dict[str, Any], start: Path) -> None:
 
 
 def trunk_of(cfg: DictConfig, out: Path) -> Path | None:
-    """The latest checkpoint that this job of a sweep can begin with, of a finished run in a sweep beside it or its own.
+    """Return the latest checkpoint of ``trunk`` that this run can begin with; None where there is none.
 
-    None: there is none, none is wanted, or this is no job of a sweep. Of several processes each would look for itself,
-    so a run that they share begins at step 0; ``resume=CHECKPOINT`` names one for all.
+    Of several processes each would look for itself, so a run that they share begins at step 0; ``resume=CHECKPOINT``
+    names one for all.
     """
     first = first_pruning(config := flat_config(resolved(cfg)))
-    wanted = cfg.reuse and not cfg.overwrite and not cfg.budget.minutes
-    if not wanted or math.isinf(first) or _is_shared(config) or HydraConfig.get().mode != RunMode.MULTIRUN:
+    if not cfg.trunk or cfg.overwrite or cfg.budget.minutes or math.isinf(first) or _is_shared(config):
         return None
-    sweeps = Path(HydraConfig.get().sweep.dir).absolute().parent
-    for moment, checkpoint in sorted(_kept(sweeps), key=lambda kept: (-kept[0], kept[1])):
-        run = checkpoint.parents[1]
-        if moment > first or run == out.absolute() or not is_whole(run):
-            continue
-        trunk = configuration_of(run)
-        if trunk is not None and is_branch(config, trunk, moment):
-            return checkpoint
-    return None
-
-
-def record_branch(out: Path, start: Path | None) -> None:
-    """Write down which run's checkpoint a run began with, where that is another one's."""
-    moment = None if start is None else moment_of(start)
-    if start is None or moment is None or lies_in(start, out):
-        return
-    trunk = run_of(start)
-    log.info("begins with %s, with which it has all steps up to there in common", start)
-    BRANCH_OF.write(out, BranchOf(run=os.path.relpath(trunk, out), label=load_run_config(trunk).name, moment=moment))
-
-
-def _kept(sweeps: Path) -> Iterator[tuple[float, Path]]:
-    for checkpoint in sweeps.glob("*/*/checkpoints/before_*.ckpt"):
-        moment = moment_of(checkpoint)
-        if moment is not None:
-            yield moment, checkpoint
+    run = Path(cfg.trunk)
+    if run.absolute() == out.absolute() or not is_whole(run) or (trunk := configuration_of(run)) is None:
+        return None
+    kept = {checkpoint_fraction(path): path for path in (run / "checkpoints").glob("before_*.ckpt")}
+    moment = max((one for one in kept if one is not None and one <= first), default=None)
+    if moment is None or not is_branch(config, trunk, moment):
+        return None
+    log.info("begins with %s, with which it has all steps up to there in common", kept[moment])
+    return kept[moment]
 
 
 def _is_shared(config: Configuration) -> bool:

@@ -32,7 +32,7 @@ WORDS = {
 MOVED = {"data.log.min_lens_shift": "effects.lens.min_shift"}
 """Keys of earlier versions -> where their value belongs now."""
 PATHS = {
-    *("out", "resume", "count_of", "data.root", "data.log.root", "data.log.parent", "image_points.cache"),
+    *("out", "resume", "count_of", "trunk", "data.root", "data.log.root", "data.log.parent", "image_points.cache"),
     *("hydra.run.dir", "hydra.sweep.dir"),
 }
 """Keys whose value is a path, in whatever letters."""
@@ -60,7 +60,7 @@ class TrainSchema:
     budget: Tree = MISSING
     resume: str | None = None
     overwrite: bool = False
-    reuse: bool = True
+    trunk: str | None = None
     checkpoint_every: Any = MISSING
     branch_points: list[float] = field(default_factory=list)
     count_of: str | None = None

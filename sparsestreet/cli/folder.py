@@ -36,8 +36,6 @@ OF_A_RUN = (
     "predictions",
     "curves",
     "pictures",
-    "same_as.json",
-    "branch_of.json",
 )
 """What a training leaves in its folder, besides its configuration and its log."""
 

@@ -1,8 +1,8 @@
 """``sparsestreet jobs +sweep=NAME,...``: what sweeps would train, before anybody starts them."""
 
 import math
+import os
 import sys
-from collections import defaultdict
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,6 @@ from rich.table import Table
 from sparsestreet.cli.branch import first_pruning, identity_of_trunk, moments_to_keep
 from sparsestreet.cli.compose import as_typed, configuration, override_problem, resolved
 from sparsestreet.cli.flags import SWEEPS, flags_of
-from sparsestreet.cli.folder import identity_of_run
 from sparsestreet.cli.sweep import finished, jobs_of, with_fixed_keys
 from sparsestreet.records.configuration import flat_config
 
@@ -26,11 +25,9 @@ sparsestreet jobs +sweep=NAME[,NAME ...] [key=value ...]
 sparsestreet jobs -m key=value,value [key=value ...]
 
 What sweeps of conf/sweep, or one of the command line, would train, with the options that train would get; nothing is
-trained or written. A job repeats another where its options, seed and drive are those of a job before it, in its own
-sweep or in one that is named before: with reuse=true (conf/train.yaml) it is trained once. A job that stands finished
-in its folder is not trained again either. One that differs from a job before it only in what it prunes begins with a
-checkpoint of that job (branch_points), so the last column has what is trained in whole runs, one sweep after the other
-on one device. Drives need not be there: data.root=a,b,c counts three.
+trained or written. A job that stands finished in its folder is not trained again. In a sweep that names a trunk
+(conf/train.yaml), a job that differs from it only in what it prunes begins with its checkpoint (branch_points). So the
+last column has what is trained in whole runs. Drives need not be there: data.root=a,b,c counts three.
 """
 
 
@@ -46,20 +43,19 @@ def _sweep(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class SweepCount:
-    """Jobs of a sweep; those that repeat another, and of the others those that stand finished.
+    """Jobs of a sweep, and those that stand finished.
 
-    ``shared``: what the rest need not train because it begins with a checkpoint of a job before it, in whole runs.
+    ``shared``: what the rest need not train because it begins with a checkpoint of its trunk, in whole runs.
     """
 
     name: str
     jobs: int
-    repeated: int
     finished: int
     shared: float = 0.0
 
     @property
     def trainings(self) -> int:
-        return self.jobs - self.repeated - self.finished
+        return self.jobs - self.finished
 
     @property
     def whole_runs(self) -> float:
@@ -89,26 +85,27 @@ def jobs(arguments: list[str]) -> int:
 
 def count_jobs(names: Sequence[str], overrides: Sequence[str]) -> list[SweepCount]:
     """The counts of each sweep, in their order. Raises what Hydra raises for options that do not compose."""
-    seen: set[Hashable] = set()
-    kept: defaultdict[Hashable, set[float]] = defaultdict(set)  # what runs have in common -> moments
     counts = []
     with configuration():
         for name in names:
-            found = list(_jobs_of(with_fixed_keys(["-m", *_sweep(name), *overrides])[1:]))
-            new = {job.identity: job for job in found if job.identity not in seen}
-            seen |= new.keys()
-            shared = sum(0.0 if job.done else job.begins(kept[job.trunk]) for job in new.values())
-            done = sum(job.done for job in new.values())
-            counts.append(SweepCount(name, len(found), len(found) - len(new), done, shared))
+            before: dict[Path, _Job] = {}
+            shared = 0.0
+            for job in _jobs_of(with_fixed_keys(["-m", *_sweep(name), *overrides])[1:]):
+                trunk = None if job.trunk is None else before.get(job.trunk)
+                shared += 0.0 if job.done or trunk is None else job.begins(trunk)
+                before[job.out] = job
+            done = sum(job.done for job in before.values())
+            counts.append(SweepCount(name, len(before), done, shared))
     return counts
 
 
 @dataclass(frozen=True)
 class _Job:
-    identity: Hashable
-    """What it trains."""
-    trunk: Hashable
+    out: Path
+    prefix: Hashable
     """What it trains before anything is pruned."""
+    trunk: Path | None
+    """The folder of the run that it would begin with."""
     first: float
     """The fraction of it at which something is pruned first."""
     keeps: tuple[float, ...]
@@ -116,11 +113,10 @@ class _Job:
     done: bool
     """Whether it stands finished in its folder."""
 
-    def begins(self, kept: set[float]) -> float:
-        """The fraction of the run at which it begins; ``kept``: its trunk's moments, to which its own are added."""
-        begins = max((moment for moment in kept if moment <= self.first < math.inf), default=0.0)
-        kept |= set(self.keeps)
-        return begins
+    def begins(self, trunk: "_Job") -> float:
+        """Return the fraction of the run at which it begins."""
+        kept = trunk.keeps if trunk.prefix == self.prefix else ()
+        return max((moment for moment in kept if moment <= self.first < math.inf), default=0.0)
 
 
 def _jobs_of(overrides: Sequence[str]) -> Iterator[_Job]:
@@ -140,18 +136,19 @@ def _job(cfg: DictConfig, out: Path, done: bool) -> _Job:
     try:
         config = flat_config(resolved(cfg))
     except (OmegaConfBaseException, ValueError):
-        return _Job(out, out, 0.0, (), done)  # what it trains follows from a run that is not there yet
+        return _Job(out, out, None, 0.0, (), done)  # what it trains follows from a run that is not there yet
     first = first_pruning(config)
-    return _Job(identity_of_run(config), identity_of_trunk(config), first, moments_to_keep(cfg), done)
+    trunk = Path(os.path.normpath(cfg.trunk)) if cfg.trunk else None
+    return _Job(Path(os.path.normpath(out)), identity_of_trunk(config), trunk, first, moments_to_keep(cfg), done)
 
 
 def _table(counts: Sequence[SweepCount]) -> Table:
     table = Table("sweep", box=None)
-    for heading in ("jobs", "repeat another", "finished", "to train", "in whole runs"):
+    for heading in ("jobs", "finished", "to train", "in whole runs"):
         table.add_column(heading, justify="right")
-    parts = ("jobs", "repeated", "finished", "shared")
+    parts = ("jobs", "finished", "shared")
     total = SweepCount("sum", *(sum(getattr(one, part) for one in counts) for part in parts))
     for one in [*counts, total] if len(counts) > 1 else counts:
-        numbers = map(str, (one.jobs, one.repeated, one.finished, one.trainings))
+        numbers = map(str, (one.jobs, one.finished, one.trainings))
         table.add_row(one.name, *numbers, f"{one.whole_runs:.1f}")
     return table

@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sparsestreet.cli.compose import configuration, load_run_config, quoted, value_of, without_flags
 from sparsestreet.cli.targets import check_modules, check_places, check_received, leaves
-from sparsestreet.records.branch_of import moment_of
+from sparsestreet.naming import checkpoint_fraction
 from sparsestreet.safe_yaml import read_yaml
 
 _PASSING = {"overrides", "runtime", "sweeper", "sweep"}
@@ -49,7 +49,7 @@ def resumed_overrides(arguments: list[str], parts: Sequence[str] = ()) -> list[s
         raise ValueError(f"{source} is damaged: it holds no list of options")
     own = {"resume", "out", "overwrite", *(_key_of(text) for text in arguments)}
     kept = [text for text in map(str, overrides) if _key_of(text) not in own]
-    branches = moment_of(Path(given)) is not None
+    branches = checkpoint_fraction(Path(given)) is not None
     folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={quoted(str(run))}"]
     _check_words(kept, without_flags([*arguments, *folder]), source, parts)
     return [*kept, *arguments, *folder]

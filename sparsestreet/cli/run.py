@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of, with_views
-from sparsestreet.cli.branch import moments_to_keep, record_branch, trunk_of
+from sparsestreet.cli.branch import moments_to_keep, trunk_of
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.device import devices_of_job
 from sparsestreet.cli.folder import lies_in, start_of, take_folder
@@ -52,7 +52,6 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         start = start_of(cfg, out) or trunk_of(cfg, out)
         if not follows_another(cfg.trainer):
             take_folder(cfg, out, goes_on=start is not None and lies_in(start, out))
-            record_branch(out, start)
     with devices_of_job(cfg.trainer) as devices:
         summary = train(
             recipe,

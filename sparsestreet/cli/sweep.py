@@ -2,10 +2,13 @@
 
 import logging
 import math
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 from hydra import compose
@@ -22,7 +25,6 @@ from sparsestreet.cli.flags import SHOWS, SWEEPS, flags_of
 from sparsestreet.cli.folder import folder_problem, holds_same_run, is_whole, same_run
 from sparsestreet.cli.locks import FolderTakenError
 from sparsestreet.cli.resolvers import UNCOUNTED
-from sparsestreet.cli.signals import beside_each_other, end_with_jobs
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
@@ -48,9 +50,25 @@ class SweepFolder(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         SweepFolder.folder = Path(config.hydra.sweep.dir)
-        if beside_each_other(config.hydra):
-            SweepFolder.folder.mkdir(parents=True, exist_ok=True)
-            end_with_jobs(SweepFolder.folder)
+        if "joblib" in config.hydra.launcher._target_:
+            # joblib ends the processes of its jobs where its own raises, and SIGTERM would leave them behind.
+            signal.signal(signal.SIGTERM, _raise_exit)
+
+
+def _raise_exit(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)
+
+
+@contextmanager
+def restored_handlers() -> Iterator[None]:
+    """Put the handlers of signals back behind the block, whatever handles signals within it."""
+    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            if handler is not None and signal.getsignal(number) is not handler:
+                signal.signal(number, handler)
 
 
 def as_sweep(arguments: list[str]) -> list[str]:

@@ -21,13 +21,12 @@ from sparsestreet.cli.folder import folder_problem, leave_folder
 from sparsestreet.cli.locks import sole_writer
 from sparsestreet.cli.process import follows_another, name_beside_first, speak_as
 from sparsestreet.cli.resume import resumed_overrides
-from sparsestreet.cli.reuse import finished_elsewhere, take_finished
-from sparsestreet.cli.signals import beside_each_other, handlers_put_back, job_beside_others
 from sparsestreet.cli.sweep import (
     SweepFolder,
     as_sweep,
     job_problem,
     note_of_sweep,
+    restored_handlers,
     run_job,
     sentence,
     sweep_problem,
@@ -69,7 +68,7 @@ def train(arguments: list[str]) -> int:
             print(f"sparsestreet train: {note}", file=sys.stderr)
     sys.argv = [sys.argv[0], *arguments]  # which Hydra reads
     SweepFolder.folder = None  # of an earlier command of this process
-    with handlers_put_back():
+    with restored_handlers():
         app()
     return sweep_status()
 
@@ -120,9 +119,7 @@ def app(cfg: DictConfig) -> float | None:
     if name := name_beside_first(cfg.trainer):
         speak_as(name)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        hydra = HydraConfig.get()
-        with job_beside_others(Path(hydra.sweep.dir)) if beside_each_other(hydra) else nullcontext():
-            return run_job(cfg, out, lambda: _run(cfg, out, started))
+        return run_job(cfg, out, lambda: _run(cfg, out, started))
     try:
         # Again, because hydra.run.dir may lead elsewhere than out.
         if problem := folder_problem(cfg, out):
@@ -148,8 +145,6 @@ def app(cfg: DictConfig) -> float | None:
 def _run(cfg: DictConfig, out: Path, started: float) -> float | None:
     # The first of several processes of a run holds the folder for all.
     with nullcontext() if follows_another(cfg.trainer) else sole_writer(out):
-        if HydraConfig.get().mode == RunMode.MULTIRUN and (standing := finished_elsewhere(cfg, out)):
-            return take_finished(cfg, standing, out)
         from sparsestreet.cli.run import run  # torch and Lightning: seconds, which a refused start does not wait for
 
         return run(cfg, out, started)

@@ -21,7 +21,7 @@ IDENTITY_KEYS = (
     "label",
     "resume",  # a resumed run is the same run
     "overwrite",
-    "reuse",
+    "trunk",  # the run whose first steps this one takes; they are its own as well
     "checkpoint_every",
     "branch_points",
     "out",
