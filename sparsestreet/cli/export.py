@@ -21,20 +21,20 @@ sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers re
   sparsestreet export outputs/RUN street.html                    one page that plays the drive, in any browser, offline
   sparsestreet export outputs/RUN empty.html edits=edits.yaml    without or with other objects
   sparsestreet export outputs/RUN street.street                  all of it, small; every command opens it like a run
-  sparsestreet export outputs/RUN street.spz time=0.5            one frame for viewers (also .sog, .compressed.ply)
+  sparsestreet export outputs/RUN street.spz time=0.5            one frame for viewers, small
   sparsestreet export outputs/RUN street.spz check=true          what the file keeps and loses, measured
   sparsestreet export outputs/RUN objects/                       each object in a file, and poses.json, for engines
   sparsestreet export outputs/RUN street.usdz                    what AlpaSim loads of it (docs/serving.md)
 
   scene      a run's folder, a scene.safetensors, or a .street; the first word without a key
-  out        (the second) the ending says what: a .street, the whole scene; .ply in the layout of 3DGS, .spz,
-             .sog or .compressed.ply, one frame; an .html (docs/viewing.md); no ending, a folder of objects.
-             docs/shipping.md says what each keeps
+  out        (the second) the ending says what: a .street, the whole scene; .ply in the layout of 3DGS or .spz,
+             one frame; an .html (docs/viewing.md); no ending, a folder of objects. docs/shipping.md says what each
+             keeps
   edits      edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   views      the views.json that holds the cameras (default: the one beside the scene, or in it)
   parts      [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
 
-of a .ply, .spz, .sog or .compressed.ply:
+of a .ply or .spz:
   time       0 to 1: first to last frame of the log (default: 0)
   nodes      [background,rigid]: only these nodes of the scene
   instance   only this object, by the name of its track; a name that does not exist lists those that do
@@ -56,9 +56,7 @@ _FRAME = ("time", "nodes", "instance")
 _OWN = {
     ".street": (),
     ".ply": _FRAME,
-    ".compressed.ply": (*_FRAME, "sky", "check"),
     ".spz": (*_FRAME, "sky", "check"),
-    ".sog": (*_FRAME, "sky", "check"),
     ".html": ("shapes",),
     "": (),
     ".usdz": ("car", "mount", "names"),
@@ -87,7 +85,7 @@ class ExportRequest:
 
     @property
     def kind(self) -> str:
-        """The file's ending."""
+        """The file's ending, of which viewers take ``.compressed.ply`` for another format than ``.ply``."""
         return ".compressed.ply" if self.out.name.endswith(".compressed.ply") else self.out.suffix
 
     def __post_init__(self) -> None:

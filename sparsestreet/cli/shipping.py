@@ -5,18 +5,13 @@ from pathlib import Path
 
 from sparsestreet.cli.scene import recorded_views
 from sparsestreet.export.check import check_file, turned_camera
-from sparsestreet.export.compressed_ply import compressed_ply_notes, read_compressed_ply, write_compressed_ply
 from sparsestreet.export.frame import UNSEEN, VIEWER_FROM_WORLD, frame_gaussians
 from sparsestreet.export.ply import scene_gaussians, write_ply
-from sparsestreet.export.sog import read_sog, write_sog
 from sparsestreet.export.spz import read_spz, spz_notes, write_spz
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, Gaussians
 
 ANTIALIAS_LOST = "trained with antialias: plain viewers show small Gaussians brighter"
-_WRITERS = {".ply": write_ply, ".spz": write_spz, ".sog": write_sog, ".compressed.ply": write_compressed_ply}
-_NOTES = {".spz": spz_notes, ".compressed.ply": compressed_ply_notes}
-_READERS = {".spz": read_spz, ".sog": read_sog, ".compressed.ply": read_compressed_ply}
 
 
 @dataclass(frozen=True)
@@ -27,7 +22,7 @@ class FrameExport:
     views: Path | None
     out: Path
     kind: str
-    """``.ply``, ``.spz``, ``.sog`` or ``.compressed.ply``."""
+    """``.ply`` or ``.spz``."""
     time: float
     nodes: tuple[str, ...] | None
     instance: str | None
@@ -45,14 +40,15 @@ def export_frame(request: FrameExport, stored: StoredScene) -> None:
     else:
         left_out, why = int((gaussians.opacities < UNSEEN).sum()), "have an opacity below 1 / 255"
         gaussians = frame_gaussians(stored, time, **chosen, sky=request.sky)
-    count = _WRITERS[request.kind](request.out, gaussians, antialiased=mip)
+    write = write_spz if request.kind == ".spz" else write_ply
+    count = write(request.out, gaussians, antialiased=mip)
     size = request.out.stat().st_size
     print(f"{request.out}: {count:,} Gaussians at time {time:g}, {size / 1e6:.2f} MB, {size / count:.1f} bytes each")
     if left_out:
         print(f"left out: {left_out:,} Gaussians that {why} at this time")
-    if mip and request.kind.endswith("ply"):
+    if mip and request.kind == ".ply":
         print(ANTIALIAS_LOST)
-    for note in _NOTES.get(request.kind, lambda _: [])(gaussians):
+    for note in spz_notes(gaussians) if request.kind == ".spz" else []:
         print(note)
     print(f"lost: {'; '.join(_lost(request, stored))}")
     if request.check:
@@ -61,7 +57,7 @@ def export_frame(request: FrameExport, stored: StoredScene) -> None:
 
 def _check(request: FrameExport, stored: StoredScene, gaussians: Gaussians) -> None:
     camera = _camera(request)
-    found = check_file(request.out, gaussians, camera, _READERS[request.kind], stored.options.settings)
+    found = check_file(request.out, gaussians, camera, read_spz, stored.options.settings)
     quality = "no camera is known" if found.psnr is None else f"{found.psnr:.1f} dB beside what was written"
     print(f"read by {found.reader}: {found.gaussians:,} Gaussians, {quality}, {found.bytes_each:.1f} bytes each")
 
