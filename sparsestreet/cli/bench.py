@@ -10,7 +10,7 @@ import torch
 
 from sparsestreet.bench.records import Provenance, RecordFile
 from sparsestreet.bench.scenes import BenchScene, Size
-from sparsestreet.cli.compose import override_problem
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.records.provenance import this_machine, this_source
 
 if TYPE_CHECKING:

@@ -11,13 +11,16 @@ from dataclasses import is_dataclass
 
 from beartype.door import is_bearable
 from beartype.roar import BeartypeException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from sparsestreet.cli.device import device_problem
 from sparsestreet.cli.limits import limit_problem
 from sparsestreet.cli.preset import preset_problem
+from sparsestreet.cli.process import shares_a_run
 from sparsestreet.cli.targets import located
+
+if typing.TYPE_CHECKING:
+    import torch
 
 Tree = typing.Any
 
@@ -132,3 +135,61 @@ def _any_fits(values: Iterable[Tree], hint: typing.Any) -> bool:
 
 def _in_words(hint: typing.Any) -> str:
     return hint.__name__ if inspect.isclass(hint) and not typing.get_args(hint) else str(hint).replace("typing.", "")
+
+
+GPU = ("gpu", "cuda")
+"""Words of ``trainer.accelerator`` that ask for a CUDA device; ``auto`` takes one where there is one."""
+
+
+def device_of(name: str, asker: str, remedy: str) -> "torch.device":
+    """The device by name: cpu, cuda, or a GPU by its number, as cuda:1.
+
+    Raises ValueError for any other name, and where torch sees no GPU: what needs one (``asker``) and what would help.
+    """
+    import torch  # seconds, which a refused start does not wait for
+
+    kind = name.partition(":")[0]
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"device must be cpu or cuda, got {name!r}")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"{asker} needs a CUDA device and torch sees none: {remedy}")
+    return torch.device(name)
+
+
+def device_problem(trainer: DictConfig) -> str | None:
+    """What is asked of devices that cannot be, in one sentence; None where it can."""
+    import torch
+
+    devices = trainer.get("devices", 1)
+    if trainer.get("accelerator") in GPU:
+        try:
+            device_of("cuda", "trainer=gpu", "sparsestreet check says why; trainer=cpu trains without")
+        except ValueError as error:
+            return str(error)
+    if shares_a_run(trainer):
+        return None
+    named = named_devices(devices)
+    if (devices not in (1, "1", "auto")) if named is None else len(named) != 1:
+        return (
+            f"training runs on one device, got trainer.devices={devices}: trainer=ddp shares a run among several, and "
+            "a sweep gives each of its jobs one"
+        )
+    if named and not on_gpu(trainer):
+        return f"trainer.devices={devices} names a GPU, and this run has none: say trainer=gpu, or leave it out"
+    if named and named[0] not in range(there := torch.cuda.device_count()):
+        return f"trainer.devices={devices} is not there: torch sees {there} of them, numbered from 0"
+    return None
+
+
+def on_gpu(trainer: DictConfig) -> bool:
+    import torch
+
+    accelerator = trainer.get("accelerator")
+    return accelerator in GPU or (accelerator in (None, "auto") and torch.cuda.is_available())
+
+
+def named_devices(devices: typing.Any) -> list[int] | None:
+    """The devices that are named by their numbers, as Lightning reads them ([3], "3," or "2,3"); None for a count."""
+    if isinstance(devices, str) and "," in devices:
+        return [int(part) for part in devices.split(",") if part.strip()]
+    return list(devices) if isinstance(devices, list | ListConfig) else None

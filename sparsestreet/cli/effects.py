@@ -11,8 +11,9 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import as_typed, composed, override_problem, value_of
+from sparsestreet.cli.compose import as_typed, composed, value_of
 from sparsestreet.cli.effect_words import with_effect_keys
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.records.effects import EffectDecision
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ import torch
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.assemble import data_of, this_command
-from sparsestreet.cli.checks import type_problem
-from sparsestreet.cli.device import device_of
+from sparsestreet.cli.checks import device_of, type_problem
 from sparsestreet.cli.options import run_command
 from sparsestreet.cli.scene import open_scene
 from sparsestreet.cli.targets import made, open_run_config

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 
-from sparsestreet.cli.compose import override_problem
+from sparsestreet.cli.problems import override_problem
 
 SHOWS = {"--cfg", "-c", "--info", "-i"}
 """Flags that print the configuration, and train nothing."""

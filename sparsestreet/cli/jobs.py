@@ -15,8 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from sparsestreet.cli.branch import first_pruning, identity_of_trunk, moments_to_keep
-from sparsestreet.cli.compose import as_typed, configuration, override_problem, resolved
+from sparsestreet.cli.compose import as_typed, configuration, resolved
 from sparsestreet.cli.flags import SWEEPS, flags_of
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.cli.sweep import finished, jobs_of, with_fixed_keys
 from sparsestreet.records.configuration import flat_config
 

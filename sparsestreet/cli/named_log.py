@@ -8,7 +8,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.auto import AUTO, with_found_data
 from sparsestreet.cli.checks import unresolvable
-from sparsestreet.cli.compose import as_typed, composed, override_problem
+from sparsestreet.cli.compose import as_typed, composed
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.cli.targets import made
 from sparsestreet.data.reader import LogReader
 

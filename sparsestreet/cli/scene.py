@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from sparsestreet.cli.device import device_of
+from sparsestreet.cli.checks import device_of
 from sparsestreet.cli.targets import open_run_config
 from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.storage import StoredScene, load_scene

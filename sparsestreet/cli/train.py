@@ -14,11 +14,12 @@ from omegaconf import DictConfig
 
 from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.branch import check_resumed
-from sparsestreet.cli.compose import CONF, as_typed, composed, override_problem, resolved, without_flags
+from sparsestreet.cli.compose import CONF, as_typed, composed, resolved, without_flags
 from sparsestreet.cli.effect_words import with_effect_keys
 from sparsestreet.cli.flags import flag_problem
 from sparsestreet.cli.folder import folder_problem, leave_folder
 from sparsestreet.cli.locks import sole_writer
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.cli.process import follows_another, name_beside_first, speak_as
 from sparsestreet.cli.resume import resumed_overrides
 from sparsestreet.cli.sweep import (

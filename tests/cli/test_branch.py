@@ -10,7 +10,8 @@ from sparsestreet.records.branch_of import BRANCH_OF, BranchOf
 
 from sparsestreet.cli import branch
 from sparsestreet.cli.branch import first_pruning, is_branch, moments_to_keep, trunk_of
-from sparsestreet.cli.compose import override_problem, resolved
+from sparsestreet.cli.compose import resolved
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.cli.train import train
 from sparsestreet.records.configuration import Configuration, flat_config
 from sparsestreet.records.costs import update_costs

@@ -11,8 +11,9 @@ from omegaconf import OmegaConf
 
 import sparsestreet.training.run  # noqa: F401 - its import takes seconds, which are of no test
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import as_typed, composed, configuration, load_run_config, override_problem, value_of
+from sparsestreet.cli.compose import as_typed, composed, configuration, load_run_config, value_of
 from sparsestreet.cli.limits import LOGGER_PACKAGES
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.cli.train import train
 from tests.typed import there
 

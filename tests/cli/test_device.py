@@ -10,7 +10,8 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli import device as device_module
 from sparsestreet.cli.assemble import trainer_of
-from sparsestreet.cli.device import device_of, device_problem, devices_of_job
+from sparsestreet.cli.checks import device_of, device_problem
+from sparsestreet.cli.device import devices_of_job
 from sparsestreet.cli.evaluate import _device
 from sparsestreet.cli.scene import open_scene
 from tests.cli.configurations import composed

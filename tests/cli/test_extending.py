@@ -12,8 +12,8 @@ from hydra.errors import InstantiationException
 from PIL import Image
 
 from sparsestreet.cli.assemble import data_of, recipe_of
-from sparsestreet.cli.compose import override_problem
 from sparsestreet.cli.data import data
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.cli.train import train
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.pruning import RenderContext

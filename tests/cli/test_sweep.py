@@ -8,9 +8,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli import sweep
 from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import CONF, override_problem
+from sparsestreet.cli.compose import CONF
 from sparsestreet.cli.jobs import SweepCount, count_jobs
 from sparsestreet.cli.jobs import jobs as jobs_command
+from sparsestreet.cli.problems import override_problem
 from sparsestreet.cli.report import sweep_name
 from sparsestreet.cli.sweep import (
     OF_DRIVES,
