@@ -8,11 +8,11 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 from sparsestreet.records.branch_of import BRANCH_OF, BranchOf
 
-from sparsestreet.cli import branch
-from sparsestreet.cli.branch import first_pruning, is_branch, moments_to_keep, trunk_of
-from sparsestreet.cli.compose import resolved
-from sparsestreet.cli.problems import override_problem
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.config.validate import override_problem
+from sparsestreet.cli.runs import shared_prefix
+from sparsestreet.cli.runs.shared_prefix import first_pruning, is_branch, moments_to_keep, trunk_of
 from sparsestreet.records.configuration import Configuration, flat_config
 from sparsestreet.records.costs import update_costs
 from sparsestreet.records.run import RUN
@@ -97,7 +97,7 @@ def kept(out: Path, *words: str, moments: Sequence[str] = ("0.6",), ended: bool 
 def sweeps(tmp_path, monkeypatch) -> Path:
     """The folder of sweeps, with ``two`` under way."""
     asked = OmegaConf.create({"mode": RunMode.MULTIRUN, "sweep": {"dir": str(tmp_path / "two")}})
-    monkeypatch.setattr(branch.HydraConfig, "get", lambda: asked)
+    monkeypatch.setattr(shared_prefix.HydraConfig, "get", lambda: asked)
     return tmp_path
 
 

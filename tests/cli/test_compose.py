@@ -10,11 +10,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import sparsestreet.training.run  # noqa: F401 - its import takes seconds, which are of no test
-from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import as_typed, composed, configuration, load_run_config, value_of
-from sparsestreet.cli.limits import LOGGER_PACKAGES
-from sparsestreet.cli.problems import override_problem
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.compose import as_typed, composed, configuration, load_run_config, value_of
+from sparsestreet.cli.config.validate import LOGGER_PACKAGES, config_problem, override_problem
 from tests.typed import there
 
 
@@ -130,7 +128,7 @@ def test_a_folder_that_would_lead_nowhere_is_refused():
 
 def test_the_first_checks_import_no_torch():
     code = (
-        "import sys; from sparsestreet.cli.train import train; status = train(['schedule.max_steps=0'])\n"
+        "import sys; from sparsestreet.cli.commands.train import train; status = train(['schedule.max_steps=0'])\n"
         "assert status == 2 and not {'torch', 'lightning'} & set(sys.modules), status"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

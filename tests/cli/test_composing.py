@@ -9,7 +9,7 @@ from hydra import compose
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig
 
-from sparsestreet.cli.compose import configuration
+from sparsestreet.cli.config.compose import configuration
 from tests.cli import composing
 
 

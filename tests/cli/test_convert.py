@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from sparsestreet.cli import convert as module
-from sparsestreet.cli.compose import CONF
-from sparsestreet.cli.data import data
+from sparsestreet.cli.commands import convert as module
+from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.config.compose import CONF
 from sparsestreet.data.convert import partial_folder
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
 from sparsestreet.data.writer import LogFile

@@ -10,8 +10,8 @@ from hydra.utils import get_object
 from lightning import Trainer
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.assemble import recipe_of, trainer_of
-from sparsestreet.cli.compose import composed
+from sparsestreet.cli.config.assemble import recipe_of, trainer_of
+from sparsestreet.cli.config.compose import composed
 from sparsestreet.scene import effects
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.masks import StaticMaskSettings

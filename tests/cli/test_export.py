@@ -10,8 +10,8 @@ import pytest
 import torch
 from plyfile import PlyData
 
-from sparsestreet.cli.export import USAGE, ExportRequest, export
-from sparsestreet.cli.render import render
+from sparsestreet.cli.commands.export import USAGE, ExportRequest, export
+from sparsestreet.cli.commands.render import render
 from sparsestreet.export.ply import scene_gaussians
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.graph import SceneGraph

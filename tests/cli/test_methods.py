@@ -11,10 +11,9 @@ import torch
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.assemble import recipe_of
-from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import CONF, resolved
-from sparsestreet.cli.problems import override_problem
+from sparsestreet.cli.config.assemble import recipe_of
+from sparsestreet.cli.config.compose import CONF, resolved
+from sparsestreet.cli.config.validate import config_problem, override_problem
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.density import GradientDensity, VibratingDensity

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from sparsestreet.cli.assemble import recipe_of
-from sparsestreet.cli.compose import CONF, resolved
+from sparsestreet.cli.config.assemble import recipe_of
+from sparsestreet.cli.config.compose import CONF, resolved
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, LightGaussianRule, MiniSplattingRule
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.density import GradientDensity, McmcDensity

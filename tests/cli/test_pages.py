@@ -11,9 +11,8 @@ import pytest
 import torch
 
 from sparsestreet.cli import COMMANDS
-from sparsestreet.cli.effect_words import with_effect_keys
-from sparsestreet.cli.options import OptionError, parse_options
-from sparsestreet.cli.problems import override_problem
+from sparsestreet.cli.commands.options import OptionError, parse_options
+from sparsestreet.cli.config.validate import override_problem, with_effect_keys
 from sparsestreet.data.drivestudio import DriveStudioReader
 from tests.cli.page_commands import RUN_ELSEWHERE, SHOWN, commands_of, elsewhere
 from tests.conftest import unchecked

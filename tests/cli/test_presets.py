@@ -5,11 +5,10 @@ from typing import Any
 
 import pytest
 
-from sparsestreet.cli.assemble import recipe_of
-from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import resolved
-from sparsestreet.cli.preset import preset_notes
-from sparsestreet.cli.upstream import alternatives, compare, pairs
+from sparsestreet.cli.commands.presets import alternatives, compare, pairs
+from sparsestreet.cli.config.assemble import recipe_of
+from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.config.validate import config_problem, preset_notes
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.training.callbacks import DensityControl, Pruning
 from sparsestreet.training.schedule import Course, Interval, milestone

@@ -14,10 +14,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.branch import check_resumed
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.resume import resumed_overrides
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.runs.resume import resumed_overrides
+from sparsestreet.cli.runs.shared_prefix import check_resumed
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.training.callbacks import RowLedger

@@ -6,14 +6,14 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli import sweep
-from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import CONF
-from sparsestreet.cli.jobs import SweepCount, count_jobs
-from sparsestreet.cli.jobs import jobs as jobs_command
-from sparsestreet.cli.problems import override_problem
-from sparsestreet.cli.report import sweep_name
-from sparsestreet.cli.sweep import (
+from sparsestreet.cli.commands.jobs import SweepCount, count_jobs
+from sparsestreet.cli.commands.jobs import jobs as jobs_command
+from sparsestreet.cli.commands.report import sweep_name
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.compose import CONF
+from sparsestreet.cli.config.validate import config_problem, override_problem
+from sparsestreet.cli.runs import sweep
+from sparsestreet.cli.runs.sweep import (
     OF_DRIVES,
     as_sweep,
     finished,
@@ -24,7 +24,6 @@ from sparsestreet.cli.sweep import (
     sweep_status,
     with_fixed_keys,
 )
-from sparsestreet.cli.train import train
 from sparsestreet.records.costs import update_costs
 from sparsestreet.records.failures import read_failures
 from sparsestreet.records.summary import SUMMARY

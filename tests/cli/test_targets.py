@@ -11,18 +11,19 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from sparsestreet.cli import COMMANDS, targets
-from sparsestreet.cli.bench import bench
-from sparsestreet.cli.compose import CONF, TrainSchema
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.export import export
-from sparsestreet.cli.objects import objects
-from sparsestreet.cli.render import render
-from sparsestreet.cli.resume import resumed_overrides
-from sparsestreet.cli.serve import serve
-from sparsestreet.cli.targets import check_received, leaves, made, named_by_conf, open_run_config
-from sparsestreet.cli.train import train
-from sparsestreet.cli.view import view
+from sparsestreet.cli import COMMANDS
+from sparsestreet.cli.commands.bench import bench
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.export import export
+from sparsestreet.cli.commands.objects import objects
+from sparsestreet.cli.commands.render import render
+from sparsestreet.cli.commands.serve import serve
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.commands.view import view
+from sparsestreet.cli.config import targets
+from sparsestreet.cli.config.compose import CONF, TrainSchema
+from sparsestreet.cli.config.targets import check_received, leaves, made, named_by_conf, open_run_config
+from sparsestreet.cli.runs.resume import resumed_overrides
 from tests.cli.configurations import composed
 
 
@@ -62,7 +63,7 @@ def attacks(mark: str) -> list[dict[str, Any]]:
         {"_target_": "omegaconf.OmegaConf.save", "config": {}, "f": mark},
         {"_target_": "sparsestreet.cli.main", "arguments": ["bench", "--out", mark]},
         {"_target_": "sparsestreet.records.strict_json.write_json", "path": path, "value": 1},
-        {"_target_": "sparsestreet.cli.sweep.SweepFolder"},
+        {"_target_": "sparsestreet.cli.runs.sweep.SweepFolder"},
         {"_target_": "antigravity.geohash", "_args_": [0, 0, mark]},
     ]
 
@@ -148,7 +149,7 @@ def test_nobody_makes_parts_of_a_configuration_that_was_not_looked_at():
 def test_the_closed_list_has_what_conf_names():
     """Found once more, by the letters; what stands under hydra is no part of a run."""
     found = {name for path in CONF.rglob("*.yaml") for name in re.findall(r"_target_: ([\w.]+)", path.read_text())}
-    assert found - {"sparsestreet.cli.sweep.SweepFolder"} == set(named_by_conf().targets)
+    assert found - {"sparsestreet.cli.runs.sweep.SweepFolder"} == set(named_by_conf().targets)
     assert len(found) > 80
     assert "sparsestreet.scene.body.SmplFile" in found  # a comment offers it
     texts = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
@@ -269,7 +270,9 @@ def test_a_file_outside_of_conf_reaches_hydra_no_more_than_a_word(package, conte
 def test_words_of_a_received_run_begin_no_sweep(tmp_path, monkeypatch):
     """The values that a sweep varies are composed job by job, where nobody looks any more."""
     run, asked = received(tmp_path / "run", "+sweep=tiny"), []
-    monkeypatch.setattr("sparsestreet.cli.train.override_problem", lambda words: asked.append(words) or "enough")
+    monkeypatch.setattr(
+        "sparsestreet.cli.commands.train.override_problem", lambda words: asked.append(words) or "enough"
+    )
     assert train([f"resume={run}"]) == 2
     assert asked == [["+sweep=tiny", f"resume={run}", f"out={run}"]]
     assert train([f"resume={run}", "+sweep=tiny"]) == 2

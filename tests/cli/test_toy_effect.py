@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from sparsestreet import load_scene
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.render import render
-from sparsestreet.cli.report import report
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.render import render
+from sparsestreet.cli.commands.report import report
+from sparsestreet.cli.commands.train import train
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY

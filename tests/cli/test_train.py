@@ -14,7 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet import load_scene
-from sparsestreet.cli.evaluate import evaluate
+from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE

@@ -5,20 +5,24 @@ from typing import Any
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.compose import CONF, resolved
-from sparsestreet.cli.options import OptionError, parse_options
-from sparsestreet.cli.presets import WIDTH, PresetsRequest, lines, overview, presets
-from sparsestreet.cli.upstream import (
+from sparsestreet.cli.commands.options import OptionError, parse_options
+from sparsestreet.cli.commands.presets import (
     KEYS,
     SETTINGS,
+    WIDTH,
+    PresetsRequest,
     Row,
     alternatives,
     compare,
     compare_settings,
+    lines,
+    overview,
     pairs,
+    presets,
     problems,
     upstream_settings,
 )
+from sparsestreet.cli.config.compose import CONF, resolved
 from sparsestreet.records.configuration import flat_config
 from tests.cli.configurations import composed
 

@@ -34,7 +34,7 @@ def test_collect_names_what_is_wrong(tmp_path):
 @pytest.mark.lengthy
 def test_a_report_imports_no_torch():
     """What import contracts cannot see: imports inside of functions, and the command."""
-    code = "import sys, sparsestreet.cli.report; sys.exit('torch' in sys.modules)"
+    code = "import sys, sparsestreet.cli.commands.report; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
