@@ -40,6 +40,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["trainer.fast_dev_runx=true"], "did you mean 'trainer.fast_dev_run'"),
         (["data.log.min_lens_shift=0.5"], "no key 'data.log.min_lens_shift': it is 'effects.lens.min_shift' now"),
         (["schedule.max_step=5"], "did you mean 'schedule.max_steps'"),
+        (["capacity=huge"], "no option 'huge' in conf/capacity: choose one of paper, small"),
         (["nod.background.num_points=5"], "did you mean 'node.background.num_points'"),
         (
             ["sparsify=papr"],
@@ -172,7 +173,6 @@ def test_flags_that_cannot_be_are_one_line(arguments, said, capsys):
         ("evaluation.presets=[fast,1,fast,fast,fast,fast,fast,fast,fast]", "evaluation.presets must be"),
         ("data.lidar.dropout=often", "data.lidar.dropout must be float, got 'often'"),
         ("data.lidar=hdl64", "data.log.settings.lidar must be LidarSensor, got 'hdl64'"),
-        ("capacity=huge", "no capacity 'huge': choose one of small, paper"),
         ("data=drivestudio", "data.root has no value: give data.root=..."),
         ("trainer.devices=2", "training runs on one device, got trainer.devices=2"),
     ],
@@ -281,7 +281,7 @@ def test_a_suggestion_is_of_the_choices_that_were_made():
 
 FILES = {
     "defaults: [paper_short, override /loss/mask_sparsity@loss: ramped]": (
-        "sparsify/mine.yaml: 'override /loss/mask_sparsity' needs a group, and conf/loss/mask_sparsity.yaml is a file: "
+        "sparsify/mine.yaml: 'override /loss/mask_sparsity' needs a group, and loss/mask_sparsity is an option: "
         "set loss.mask_sparsity.KEY in your file"
     ),
     "defaults: [paper_short, override /pruning@callback.pruning.rules: removal]": (

@@ -38,8 +38,8 @@ def test_a_failed_writer_leaves_no_lock(tmp_path):
 
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
     """Its file is still there; a link in its place is no way to another file."""
-    code = "import sys, time; from sparsestreet.cli.runs.locks import hold; from pathlib import Path; "
-    code += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    code = "import sys, time; from sparsestreet.cli.runs.locks import acquire; from pathlib import Path; "
+    code += "acquire(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
     path = tmp_path / "slot"
     process = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "held\n"

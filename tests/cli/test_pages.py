@@ -10,7 +10,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from sparsestreet.cli import COMMANDS
+from sparsestreet.cli import COMMANDS, MODULES
 from sparsestreet.cli.commands.options import OptionError, parse_options
 from sparsestreet.cli.config.validate import override_problem, with_effect_keys
 from sparsestreet.data.drivestudio import DriveStudioReader
@@ -38,7 +38,7 @@ def problem_of(command: str) -> str | None:
         words = [word for word in words if "=" in word or word.startswith("-")] if name == "data" else words
         several = ["-m"] if any(word.startswith("+sweep=") for word in words) else []
         return override_problem(with_effect_keys([*several, *words]))
-    module = importlib.import_module(f"sparsestreet.cli.{name}")
+    module = importlib.import_module(f"sparsestreet.cli.commands.{MODULES.get(name, name)}")
     with pytest.MonkeyPatch.context() as patch:
         return _bench_problem(module, words, patch) if name == "bench" else _option_problem(module, name, words, patch)
 

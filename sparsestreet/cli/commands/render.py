@@ -10,9 +10,7 @@ from sparsestreet.cli.commands.options import run_command
 from sparsestreet.cli.config.compose import check_moved
 from sparsestreet.cli.config.log_from_options import reader_of
 from sparsestreet.cli.config.targets import open_run_config
-from sparsestreet.export.lidar import LidarReturns
 from sparsestreet.records.run import RUN
-from sparsestreet.scene.views import RecordedViews
 
 if TYPE_CHECKING:
     from sparsestreet.export.lidar import LidarReturns
@@ -22,11 +20,13 @@ if TYPE_CHECKING:
     from sparsestreet.types import View
 
 
-def returns_of(run: Path, views: RecordedViews, parts: Sequence[str] = ()) -> LidarReturns:
+def lidar_of_run(run: Path, views: "RecordedViews", parts: Sequence[str] = ()) -> "LidarReturns":
     """Returns the sweeps at the times of their frames, in the world of the scene; ``parts`` as for ``open_scene``.
 
     Raises ValueError in one sentence where the log is not there, is another one, or has no lidar.
     """
+    from sparsestreet.export.lidar import LidarReturns
+
     try:
         config = open_run_config(run, parts)
         check_moved(config)
@@ -187,7 +187,7 @@ def _render(request: RenderRequest) -> None:
             f"{fps:g} frames a second, as the log has: fps=20 shows poses between them (data.log.rate=all, in "
             "training, reads every image of a log that has keyframes)"
         )
-    returns = returns_of(folder_of(request.scene), views, request.parts) if "lidar" in request.layers else None
+    returns = lidar_of_run(folder_of(request.scene), views, request.parts) if "lidar" in request.layers else None
     count = _write(request, stored, path, fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"
     print(f"{request.out}: {count} frames of {what} at {fps:g} a second{_speed(request, log_fps)}, {made}")

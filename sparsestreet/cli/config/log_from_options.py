@@ -8,7 +8,7 @@ import importlib
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hydra import compose
 from hydra.core.global_hydra import GlobalHydra
@@ -20,7 +20,9 @@ from sparsestreet.cli.config.compose import as_typed, composed, configuration
 from sparsestreet.cli.config.targets import made
 from sparsestreet.cli.config.validate import override_problem, unresolvable
 from sparsestreet.data.marks import UNREAD, Marks
-from sparsestreet.data.reader import LogReader
+
+if TYPE_CHECKING:
+    from sparsestreet.data.reader import LogReader
 
 AUTO = "data=auto"
 _MORE = "docs/datasets/README.md says what is read"
@@ -162,6 +164,6 @@ def compose_data(overrides: Sequence[str]) -> DictConfig:
     return copy.deepcopy(composed(overrides))
 
 
-def reader_of(cfg: DictConfig) -> LogReader:
+def reader_of(cfg: DictConfig) -> "LogReader":
     """Raises what the reader's class raises for its values, as ``made`` does."""
     return made(cfg.data.log)

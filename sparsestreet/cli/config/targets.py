@@ -67,7 +67,8 @@ def named_by_conf() -> ClosedList:
             values.add((place, repr(value)))
     for path in CONF.rglob("*.yaml"):
         for name in re.findall(r"#.*_target_: ([\w.]+)", path.read_text(encoding="utf-8")):  # offered in a comment
-            group = path.relative_to(CONF).parts[0]
+            folder = path.relative_to(CONF).parts[0]
+            group = path.stem if folder == "options" else folder
             targets.setdefault(name, set()).add(group if group in _ROOTS else "")
     rooted = {name: frozenset() if "" in roots else frozenset(roots) for name, roots in targets.items()}
     resolvers = {name for text in texts for name in re.findall(r"\$\{([\w.]+):", text)}

@@ -176,11 +176,9 @@ def _explain_file(reason: str, overrides: list[str]) -> str:
         key = re.search(r"full_key: (\S+)", rest)
         return _unknown_key(key[1]) if key and " not in " in rest else _explain(rest, overrides)
     chosen = re.search(r"Could not override '([^'@]+)(@[^']*)?'. No match", first)
-    if chosen and (CONF / f"{chosen[1]}.yaml").is_file():
+    if chosen and any(place == chosen[1] for place, _, _ in config_files()):
         keys = chosen[1].replace("/", ".")
-        return (
-            f"'override /{chosen[1]}' needs a group, and conf/{chosen[1]}.yaml is a file: set {keys}.KEY in your file"
-        )
+        return f"'override /{chosen[1]}' needs a group, and {chosen[1]} is an option: set {keys}.KEY in your file"
     if chosen:
         return f"'override /{chosen[1]}{chosen[2] or ''}' overrides nothing that the defaults before it choose"
     return _explain(reason, overrides)
@@ -230,7 +228,7 @@ def _meant(key: str, overrides: Sequence[str] = ()) -> list[str]:
         chosen = composed(
             [text for text in groups if not text.startswith(("+", key)) and text.partition("=")[0] != key]
         )
-        known = (*known, *(set(_keys(OmegaConf.to_container(chosen, resolve=False))) - set(known)))
+        known = (*known, *(set(_keys_of(chosen)) - set(known)))
     alike = 0.5 if len(key) >= SHORT else 0.8
     found = [] if "." in key else _by_last_name(key, known)
     found = found or nearest(key, known, cutoff=alike)
@@ -262,11 +260,17 @@ def _known() -> tuple[tuple[str, ...], dict[str, str]]:
         cfg = compose("train", return_hydra_config=True)
     groups = dict.fromkeys(group for place, _, _ in config_files() if (group := place.rpartition("/")[0]))
     places = [key for key in cfg.hydra.runtime.choices if "@" in key]
-    values = _keys(OmegaConf.to_container(composed(()), resolve=False))
+    values = _keys_of(composed(()))
     follows = {key: re.fullmatch(r"\$\{([\w.]+)\}", str(value)) for key, value in values.items()}
     last = {key: key.rpartition(".")[2] for key in values}
     leaders = {key: found[1] for key, found in follows.items() if found and found[1].endswith(f".{last[key]}")}
     return (*values, *groups, *places), leaders
+
+
+def _keys_of(cfg: DictConfig) -> dict[str, object]:
+    """Without the numbers of the capacity, which are set where they act."""
+    found = _keys(OmegaConf.to_container(cfg, resolve=False))
+    return {key: value for key, value in found.items() if not key.startswith("capacity.")}
 
 
 def _keys(tree: object, prefix: str = "") -> dict[str, object]:

@@ -25,7 +25,7 @@ from sparsestreet.cli.config.validate import config_problem, preset_notes
 from sparsestreet.cli.process import is_worker_rank, keep_freed_memory
 from sparsestreet.cli.runs.devices import devices_of_job
 from sparsestreet.cli.runs.folder import lies_in, start_of, take_folder
-from sparsestreet.cli.runs.shared_prefix import moments_to_keep, trunk_of
+from sparsestreet.cli.runs.shared_prefix import moments_to_keep, start_from_trunk
 from sparsestreet.evaluation.memory import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.callbacks import PhaseTimes
@@ -62,7 +62,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(known, this_command(["train", *HydraConfig.get().overrides.task]))
         recipe = recipe_of(known)
-        start = start_of(cfg, out) or trunk_of(cfg, out)
+        start = start_of(cfg, out) or start_from_trunk(cfg, out)
         if not is_worker_rank(cfg.trainer):
             take_folder(cfg, out, goes_on=start is not None and lies_in(start, out))
     with devices_of_job(cfg.trainer) as devices:

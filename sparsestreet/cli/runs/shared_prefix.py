@@ -83,7 +83,7 @@ def check_resumed(config: dict[str, Any], start: Path) -> None:
         raise ValueError(f"a run goes on as it began, but {len(changed)} options differ: {said}; start a new run")
 
 
-def trunk_of(cfg: DictConfig, out: Path) -> Path | None:
+def start_from_trunk(cfg: DictConfig, out: Path) -> Path | None:
     """Return the latest checkpoint of ``trunk`` that this run can begin with; None where there is none.
 
     Of several processes each would look for itself, so a run that they share begins at step 0; ``resume=CHECKPOINT``

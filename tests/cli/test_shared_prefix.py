@@ -4,20 +4,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from hydra.types import RunMode
 from omegaconf import OmegaConf
-from sparsestreet.records.branch_of import BRANCH_OF, BranchOf
 
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import resolved
 from sparsestreet.cli.config.validate import override_problem
-from sparsestreet.cli.runs import shared_prefix
-from sparsestreet.cli.runs.shared_prefix import first_pruning, is_branch, moments_to_keep, trunk_of
+from sparsestreet.cli.runs.shared_prefix import first_pruning, is_branch, moments_to_keep, start_from_trunk
 from sparsestreet.records.configuration import Configuration, flat_config
 from sparsestreet.records.costs import update_costs
 from sparsestreet.records.run import RUN
-from sparsestreet.report.collect import collect
-from sparsestreet.report.sweep import _branches
 from tests.cli import configurations
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.test_resume import assert_equal, curve
@@ -48,7 +43,7 @@ RULES = "schedule.removal_at=[0.4,0.6]"
         (("seed=1", "sparsify=importance"), (), 0.5, False),
         (("sparsify=importance", "schedule.max_steps=900"), (), 0.5, False),
         (("sparsify=importance", "node.rigid.max_gaussians=900"), (), 0.5, False),
-        (("sparsify=importance", "branch_points=[0.2]", "checkpoint_every=7", "reuse=false"), (), 0.5, True),
+        (("sparsify=importance", "branch_points=[0.2]", "checkpoint_every=7", "trunk=x"), (), 0.5, True),
     ],
 )
 def test_what_runs_have_in_common(run, trunk, moment, shared):
@@ -93,44 +88,37 @@ def kept(out: Path, *words: str, moments: Sequence[str] = ("0.6",), ended: bool 
     return [out / "checkpoints" / f"before_{moment}.ckpt" for moment in moments]
 
 
-@pytest.fixture
-def sweeps(tmp_path, monkeypatch) -> Path:
-    """The folder of sweeps, with ``two`` under way."""
-    asked = OmegaConf.create({"mode": RunMode.MULTIRUN, "sweep": {"dir": str(tmp_path / "two")}})
-    monkeypatch.setattr(shared_prefix.HydraConfig, "get", lambda: asked)
-    return tmp_path
-
-
 @pytest.mark.parametrize(
-    ("trunk", "run", "found"),
+    ("left", "run", "found"),
     [
         ({}, (), True),
         ({"ended": False}, (), False),
         ({"moments": ["0.8"]}, (), False),
-        ({}, ("reuse=false",), False),
+        ({}, ("trunk=null",), False),
         ({}, ("overwrite=true",), False),
         ({}, ("seed=1",), False),
         ({}, ("budget.minutes=3",), False),
         ({}, ("trainer=ddp",), False),
         ({}, ("sparsify=none",), False),
     ],
-    ids=["", "unfinished", "too late", "reuse=false", "overwrite", "seed", "minutes", "ddp", "plain"],
+    ids=["", "unfinished", "too late", "none is named", "overwrite", "seed", "minutes", "ddp", "plain"],
 )
-def test_the_trunk_of_a_job_is_found(sweeps, trunk, run, found):
-    (left,) = kept(sweeps / "one" / "job", **trunk)
+def test_the_start_from_trunk_a_job_is_the_run_that_it_names(tmp_path, left, run, found):
+    (checkpoint,) = kept(tmp_path / "one" / "job", **left)
     words = run if "sparsify=none" in run else (*ARM, *run)
-    assert trunk_of(configurations.composed(*words), sweeps / "two" / "job") == (left if found else None)
+    cfg = configurations.composed(f"trunk={tmp_path / 'one' / 'job'}", *words)
+    assert start_from_trunk(cfg, tmp_path / "two" / "job") == (checkpoint if found else None)
 
 
-def test_the_latest_moment_comes_first_and_ones_own_folder_is_none(sweeps):
-    (early,) = kept(sweeps / "one" / "early", moments=["0.5"])
-    late = kept(sweeps / "two" / "late", moments=["0.65", "0.9"])
-    out = sweeps / "two" / "job"
-    kept(out, *ARM, moments=["0.7"])
-    cfg = configurations.composed(*ARM)
-    assert trunk_of(cfg, out) == late[0]
-    (sweeps / "two" / "late" / ".hydra" / "config.yaml").write_text("a: [")
-    assert trunk_of(cfg, out) == early
+def test_the_latest_moment_comes_first_and_ones_own_folder_is_none(tmp_path):
+    early, late, _ = kept(tmp_path / "trunk", moments=["0.5", "0.65", "0.9"])
+    cfg = configurations.composed(*ARM, f"trunk={tmp_path / 'trunk'}")
+    assert start_from_trunk(cfg, tmp_path / "job") == late
+    assert start_from_trunk(cfg, tmp_path / "trunk") is None
+    late.unlink()
+    assert start_from_trunk(cfg, tmp_path / "job") == early
+    (tmp_path / "trunk" / ".hydra" / "config.yaml").write_text("a: [")
+    assert start_from_trunk(cfg, tmp_path / "job") is None
 
 
 SHORT = ["schedule.max_steps=20", "trainer.val_check_interval=7", *TINY_RIGID]
@@ -142,16 +130,13 @@ def sweep(tiny_street, tmp_path_factory) -> Path:
     """A plain run, then one that prunes."""
     folder = tmp_path_factory.mktemp("branches") / "sweep"
     assert train([*tiny_street, *SHORT, "branch_points=[0.6]", f"out={folder / 'none'}"]) == 0
-    place = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${sparsify.name}"]
+    place = [f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${sparsify.name}", "trunk='${folder}/../none'"]
     assert train(["-m", *tiny_street, *SHORT, *LATE, *place]) == 0
     return folder
 
 
 def test_a_job_begins_with_the_checkpoint_of_its_trunk_and_ends_as_if_it_had_not(sweep, tiny_street, tmp_path, capsys):
-    assert BRANCH_OF.read(sweep / "importance") == BranchOf(run="../none", label="streetgs", moment=0.6)
-    assert not BRANCH_OF.exists(sweep / "none")
-    (note,) = _branches(collect([sweep]))
-    assert note.endswith(": importance")
+    assert "before_0.6.ckpt, with which it has all steps" in (sweep / "importance" / "train.log").read_text()
     whole = tmp_path / "whole"
     assert train([*tiny_street, *SHORT, *LATE, f"out={whole}"]) == 0
     assert_equal(whole, sweep / "importance")
@@ -185,4 +170,3 @@ def test_a_branch_may_be_named(sweep, tmp_path):
     assert train([f"resume={checkpoint}", *LATE, f"out={out}"]) == 0
     assert_equal(sweep / "importance", out)
     assert curve(out) == curve(sweep / "importance")
-    assert (out / BRANCH_OF.read(out).run).resolve() == sweep / "none"
