@@ -263,7 +263,11 @@ def _known() -> tuple[tuple[str, ...], dict[str, str]]:
     values = _keys_of(composed(()))
     follows = {key: re.fullmatch(r"\$\{([\w.]+)\}", str(value)) for key, value in values.items()}
     last = {key: key.rpartition(".")[2] for key in values}
-    leaders = {key: found[1] for key, found in follows.items() if found and found[1].endswith(f".{last[key]}")}
+    leaders = {
+        key: found[1]
+        for key, found in follows.items()
+        if found and found[1] in values and found[1].endswith(f".{last[key]}")
+    }
     return (*values, *groups, *places), leaders
 
 
