@@ -1,4 +1,4 @@
-"""Files that ``sparsestreet export`` writes for others: a frame for viewers (.ply, .spz), a scene for AlpaSim (.usdz)."""
+"""Files that ``sparsestreet export`` writes for others: a frame for viewers, and a scene for AlpaSim."""
 
 from dataclasses import dataclass
 from pathlib import Path
