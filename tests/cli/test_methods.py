@@ -31,9 +31,9 @@ from tests.typed import as_a, there
 
 METHODS, SPARSIFY = options_of("method"), options_of("sparsify")
 PAIRS = list(itertools.product(METHODS, SPARSIFY))
-WITH_EACH = ("paper", "removal", "capped")
+WITH_EACH = ("removal",)
 COMPOSED = [pair for pair in PAIRS if pair[0] == "streetgs" or pair[1] in WITH_EACH]
-"""The pairs that a daily run composes: each option once; each method with masks, both kinds of pruning and a cap."""
+"""The pairs that a daily run composes: each option once; each method with masks and pruning."""
 DAILY = [("3dgs", "removal"), ("omnire", "removal"), ("pvg", "masks"), ("deformgs", "none")]
 """The pairs that a daily run trains: every method, every stage. The run of conftest.py is StreetGS. The rule of the
 paper takes part in test_toy_node.py."""

@@ -281,10 +281,10 @@ def test_what_is_lacking_is_said_in_plain_words():
     assert any(key.startswith("preset.absent.") for key in flat("drivestudio", "pvg"))
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "method"),
-    [("drivestudio_legacy", "omnire"), pytest.param("drivestudio", "pvg", marks=pytest.mark.slow)],
+    [("drivestudio_legacy", "omnire"), ("drivestudio", "pvg")],
 )
 def test_a_preset_trains_and_says_what_it_is(preset: str, method: str, run_train, tmp_path, capsys):
     """Every part of it: smaller images first, density control, all terms."""

@@ -79,6 +79,7 @@ def stopped_early(tiny_street, tmp_path_factory) -> Path:
     return stopped_at(23, tiny_street, tmp_path_factory.mktemp("stopped") / "run")
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_can_be_evaluated(stopped_early, tmp_path):
     shutil.copytree(stopped_early, tmp_path / "run")
     assert evaluate([f"run={tmp_path / 'run'}"]) == 0

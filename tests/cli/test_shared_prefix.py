@@ -135,6 +135,7 @@ def sweep(tiny_street, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_job_begins_with_the_checkpoint_of_its_trunk_and_ends_as_if_it_had_not(sweep, tiny_street, tmp_path, capsys):
     assert "before_0.6.ckpt, with which it has all steps" in (sweep / "importance" / "train.log").read_text()
     whole = tmp_path / "whole"
@@ -151,6 +152,7 @@ def test_a_job_begins_with_the_checkpoint_of_its_trunk_and_ends_as_if_it_had_not
     assert there(arm.training_seconds) > 0.3 * there(trunk.training_seconds)
 
 
+@pytest.mark.slow
 def test_a_branch_that_is_none_is_refused_and_touches_nothing(sweep, tmp_path, capsys):
     checkpoint = sweep / "none" / "checkpoints" / "before_0.6.ckpt"
     before = {path: path.stat().st_mtime_ns for path in sweep.rglob("*")}

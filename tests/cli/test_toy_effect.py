@@ -68,6 +68,7 @@ def test_it_is_timed_counted_and_reported(toy_run, capsys):
     assert "streetgs+removal" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_commands_open_it_where_its_module_is_trusted(toy_run, tmp_path, capsys):
     """A run may come from anybody; the user's own command says whose code may run."""
     run = shutil.copytree(toy_run, tmp_path / "run")

@@ -63,6 +63,7 @@ def test_where_memory_does_not_do_it_is_one_line(tmp_path, capsys, monkeypatch):
     ]
 
 
+@pytest.mark.slow
 def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):
     """By Lightning's launcher, which is asked for the words alone; of a sweep each job has its own."""
     started = []

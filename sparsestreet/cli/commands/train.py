@@ -1,6 +1,7 @@
 """``sparsestreet train``: compose, then ``training/run.py``, once or for each job of a sweep."""
 
 import os
+import signal
 import sys
 import time
 from contextlib import nullcontext
@@ -67,8 +68,12 @@ def train(arguments: list[str]) -> int:
             print(f"sparsestreet train: {note}", file=sys.stderr)
     sys.argv = [sys.argv[0], *arguments]  # which Hydra reads
     SweepFolder.folder = None  # of an earlier command of this process
-    with restored_handlers():
-        app()
+    try:
+        with restored_handlers():
+            app()
+    except KeyboardInterrupt:
+        print("sparsestreet train: stopped; the same command goes on from the newest checkpoints", file=sys.stderr)
+        return 128 + signal.SIGINT
     return sweep_status()
 
 
