@@ -36,7 +36,7 @@ class TrackedSettings(NodeSettings):
     box, and from points from images there."""
 
     min_instance_gaussians: float = 10.0
-    points_per_instance: int = 300
+    points_per_instance: int = 5000
     box_points: int = 1000
     """An instance with fewer points than this gets additional random points on the faces of its box; 0: none does, and
     an instance without any point is left out."""
