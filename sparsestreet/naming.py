@@ -1,7 +1,9 @@
-"""Names that others wrote: as a terminal may show them, and those that were probably meant."""
+"""Names: as a terminal may show them, those that were probably meant, and those of checkpoints that stay."""
 
 import difflib
+import re
 from collections.abc import Iterable
+from pathlib import Path
 
 LONGEST = 100
 """Letters of a name that are compared: difflib takes seconds for a name of megabytes."""
@@ -35,3 +37,22 @@ def nearest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.6)
     """
     short = {one[:LONGEST]: one for one in known}
     return [short[one] for one in difflib.get_close_matches(name[:LONGEST], short, n=most, cutoff=cutoff)]
+
+
+def kept_before(moment: float) -> str:
+    """Return the name of the checkpoint that has the last step before what happens after a fraction of the run.
+
+    >>> kept_before(0.93334)
+    'before_0.93334.ckpt'
+    """
+    return f"before_{moment!r}.ckpt"
+
+
+def checkpoint_fraction(checkpoint: Path) -> float | None:
+    """Return the fraction of the run before which a checkpoint was kept; None for another checkpoint.
+
+    >>> checkpoint_fraction(Path("checkpoints/before_0.6.ckpt")), checkpoint_fraction(Path("checkpoints/last.ckpt"))
+    (0.6, None)
+    """
+    found = re.fullmatch(r"before_([\d.e-]+)\.ckpt", checkpoint.name)
+    return float(found[1]) if found else None

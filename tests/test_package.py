@@ -25,7 +25,7 @@ def test_the_import_is_light():
 
 @pytest.mark.parametrize("command", ["render", "export", "serve", "presets"])
 def test_the_help_of_a_command_is_light(command):
-    code = f"import sys; from sparsestreet.cli.{command} import {command} as run; run(['--help']); "
+    code = f"import sys; from sparsestreet.cli.commands.{command} import {command} as run; run(['--help']); "
     code += "sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False, capture_output=True).returncode == 0
 

@@ -43,6 +43,8 @@ COMMANDS = (
 )  # fmt: skip
 
 
+MODULES = {"check": "gpu_check"}
+"""Command -> the module that holds it, where that has another name."""
 READER_GONE = 128 + 13
 """Status of a program that SIGPIPE ended, as a shell counts."""
 
@@ -67,9 +69,10 @@ def _run(command: str, rest: list[str]) -> int:
         return 0
     prepare_process()
     if command in COMMANDS:
-        # Each command is the function of its name in the module of its name, and imported only when it is called:
-        # lightning alone takes seconds to import, and a report needs none of it.
-        return getattr(importlib.import_module(f"sparsestreet.cli.{command}"), command)(rest)
+        # Each command is the function of its name, in a module that is imported only when it is called: lightning alone
+        # takes seconds to import, and a report needs none of it.
+        module = importlib.import_module(f"sparsestreet.cli.commands.{MODULES.get(command, command)}")
+        return getattr(module, command)(rest)
     from sparsestreet.naming import nearest
 
     close = nearest(command, COMMANDS)

@@ -21,10 +21,10 @@ SPINS = "10000"
 def prepare_process() -> None:
     """Keep freed memory, and sleep instead of spinning; what the environment says of either stays as it is."""
     keep_freed_memory()
-    wait_politely()
+    use_passive_wait()
 
 
-def nobody_reads() -> bool:
+def stdout_closed() -> bool:
     """Whether the reader of our output has enough (``| head``): the pipe is broken, by its state and not by an error.
 
     Where there is no such question to ask (Windows, output that is no file), nobody is said to read.
@@ -55,7 +55,7 @@ def keep_freed_memory() -> None:
         libc.mallopt(_TRIM_THRESHOLD, -1)
 
 
-def wait_politely() -> None:
+def use_passive_wait() -> None:
     """Let threads that wait for each other sleep after a moment.
 
     By default libgomp's threads look at a barrier a hundred thousands of times, for milliseconds. Where another process
@@ -70,7 +70,7 @@ def shares_a_run(trainer: Mapping[str, Any]) -> bool:
     return trainer.get("strategy") not in (None, "auto")
 
 
-def follows_another(trainer: Mapping[str, Any]) -> bool:
+def is_worker_rank(trainer: Mapping[str, Any]) -> bool:
     """Whether this process is one of those that a run's first one, or the cluster, started beside it."""
     return name_beside_first(trainer) is not None
 
@@ -91,7 +91,7 @@ def name_beside_first(trainer: Mapping[str, Any]) -> str | None:
     return f"process {given['LOCAL_RANK']}{node}"
 
 
-def speak_as(name: str) -> None:
+def set_log_prefix(name: str) -> None:
     """Let this process, which others of its run go before, say nothing but warnings and errors, and who it is.
 
     The first says what all of them do.

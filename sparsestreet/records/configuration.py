@@ -21,11 +21,12 @@ IDENTITY_KEYS = (
     "label",
     "resume",  # a resumed run is the same run
     "overwrite",
-    "reuse",
+    "trunk",  # the run whose first steps this one takes; they are its own as well
     "checkpoint_every",
     "branch_points",
     "out",
     "folder",
+    "capacity.*",  # its numbers are compared where they act
     "count_of",  # the run whose counts a control copies; the counts are options of their own
     "data.root",  # where a log lies; the scene's name identifies it
     "data.log.root",

@@ -1,11 +1,10 @@
 """Finds the records of finished runs, and writes what of them a repository can keep."""
 
 import re
-from collections.abc import Iterable, Sequence, Set
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.records.same_as import SAME_AS
 from sparsestreet.records.strict_json import json_line, write_atomically
 from sparsestreet.records.summary import SUMMARY, RunSummary
 
@@ -34,15 +33,7 @@ def collect(roots: Iterable[Path]) -> list[RunRecord]:
         if not found:
             raise FileNotFoundError(f"{root} holds no {SUMMARY.name}: train and evaluate a run there first")
         folders |= {folder.resolve() for folder in found}
-    records = [RunRecord(folder, SUMMARY.read(folder)) for folder in sorted(folders)]
-    return [record for record in records if not _stands_for_another(record, folders)]
-
-
-def _stands_for_another(record: RunRecord, folders: Set[Path]) -> bool:
-    same = SAME_AS.find(record.folder)
-    if same is None or same.label != record.summary.run.label:
-        return False
-    return (record.folder / same.run).resolve() in folders
+    return [RunRecord(folder, SUMMARY.read(folder)) for folder in sorted(folders)]
 
 
 def keep_records(records: Sequence[RunRecord], path: Path) -> None:

@@ -5,9 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
-from sparsestreet.records.branch_of import BRANCH_OF
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
-from sparsestreet.records.same_as import SAME_AS
 from sparsestreet.records.strict_json import write_atomically
 from sparsestreet.report.arms import Arm, arms, busy_arms, incomplete, plain_of, why_apart
 from sparsestreet.report.beside import beside_the_path
@@ -62,8 +60,6 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
         *_effects_alike(found),
         *_baseline(found),
         *_unfinished(records),
-        *_taken(records),
-        *_branches(records),
         *absent,
     ]
     write_atomically(folder / "tables.md", markdown(grids) + "\n" + "".join(f"- {note}\n" for note in notes))
@@ -172,17 +168,6 @@ def _baseline(found: Sequence[Arm]) -> list[str]:
 def _caps(found: Sequence[Arm]) -> list[str]:
     held = sorted({arm.title for arm in found for record in arm.records if record.summary.run.caps})
     return [f"counts held down by max_gaussians, so that shares of them say little: {', '.join(held)}"] if held else []
-
-
-def _taken(records: Sequence[RunRecord]) -> list[str]:
-    names = [record.folder.name for record in records if SAME_AS.exists(record.folder)]
-    return [f"trained by another sweep, whose runs these are: {', '.join(names)}"] if names else []
-
-
-def _branches(records: Sequence[RunRecord]) -> list[str]:
-    names = [record.folder.name for record in records if BRANCH_OF.exists(record.folder)]
-    said = "begun with a checkpoint of another run, whose seconds until then count as theirs"
-    return [f"{said}: {', '.join(names)}"] if names else []
 
 
 def _unfinished(records: Sequence[RunRecord]) -> list[str]:

@@ -61,26 +61,32 @@ def rates_of(said: Rates) -> dict[str, LearningRate]:
 
 
 def usual_rates() -> dict[str, LearningRate]:
-    """Returns rates for runs of 30,000 steps: those of 3DGS (Kerbl et al. 2023) for Gaussians.
-
-    Rates of masks and tracks are those of conf/schedule/paper.yaml and conf/node/rigid.yaml.
+    """Return the rates of conf/schedule/short.yaml: for Gaussians twice those of 3DGS (Kerbl et al. 2023).
 
     >>> usual_rates()["opacity_logits"].initial
-    0.05
+    0.1
     """
     return {
-        "means": LearningRate(1.6e-4, 1.6e-6, scale_by_scene_radius=True),
-        "log_scales": LearningRate(5e-3),
-        "quaternions": LearningRate(1e-3),
-        "opacity_logits": LearningRate(5e-2),
-        "sh_dc": LearningRate(2.5e-3),
-        "sh_rest": LearningRate(1.25e-4),
+        "means": LearningRate(3.2e-4, 3.2e-6, scale_by_scene_radius=True),
+        "log_scales": LearningRate(1e-2),
+        "quaternions": LearningRate(2e-3),
+        "opacity_logits": LearningRate(1e-1),
+        "sh_dc": LearningRate(5e-3),
+        "sh_rest": LearningRate(2.5e-4),
         "mask_features": LearningRate(1e-3),
         "mask": LearningRate(1.6e-3),
-        "mask_logits": LearningRate(1e-2),
-        "rotation_deltas": LearningRate(1e-5, 5e-6),
-        "translation_deltas": LearningRate(5e-4, 1e-4),
+        "mask_logits": LearningRate(3e-2),
     }
+
+
+def usual_track_rates() -> dict[str, LearningRate]:
+    """Return ``usual_rates`` and those of conf/node/rigid.yaml for the corrections of boxes.
+
+    >>> usual_track_rates()["rotation_deltas"].final
+    5e-06
+    """
+    deltas = {"rotation_deltas": LearningRate(1e-5, 5e-6), "translation_deltas": LearningRate(5e-4, 1e-4)}
+    return usual_rates() | deltas
 
 
 def matching_rate(name: str, rates: Rates, where: str) -> LearningRate:

@@ -20,7 +20,7 @@ class OptimizerSettings:
     """Adam's epsilon. At torch's default of 1e-8 mask logits whose only gradient is lambda_n / K never move."""
     visible_only: bool = False
     """True: rows whose gradient is exactly zero keep their values and moments (VisibleAdam)."""
-    largest_radius: float | None = None
+    largest_radius: float | None = 40.0
     """Meters: rates that are scaled by the scene's radius count no more of it. Detail does not grow with the length of
     a drive. None: all of it (3DGS, DriveStudio)."""
 

@@ -32,7 +32,7 @@ class Recipe:
     """What changes Gaussians, and what watches; every run has those of ``training/run.py`` beside them."""
     optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
     options: RenderOptions = DEFAULT_OPTIONS
-    sh_interval: float = 1 / 30
+    sh_interval: float = 0.0333
     """Fraction of the run after which one more degree of spherical harmonics is used."""
     resolution: ResolutionSchedule = field(default_factory=ResolutionSchedule)
     """Size of the images that steps train on; by default they are whole."""

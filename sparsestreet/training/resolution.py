@@ -28,7 +28,7 @@ class ResolutionSchedule:
 
     halvings: int = 0
     """0: all images are whole."""
-    double_in: float = 250 / 30_000
+    double_in: float = 0.00833
 
     def __post_init__(self) -> None:
         if self.halvings < 0 or not self.double_in > 0:

@@ -5,8 +5,8 @@ from functools import cache
 from hydra import compose
 from omegaconf import DictConfig
 
-from sparsestreet.cli import compose as of_train
-from sparsestreet.cli.compose import configuration
+from sparsestreet.cli.config import compose as of_train
+from sparsestreet.cli.config.compose import configuration
 
 
 def composed(*overrides: str) -> DictConfig:

@@ -8,14 +8,11 @@ import jaxtyping
 import pytest
 from lightning import Callback, Trainer
 
-from sparsestreet.cli.data import data
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.commands.train import train
 from sparsestreet.training.lightning import callbacks_of
-from tests.cli import composing
 from tests.conftest import unchecked
 from tests.shared import made_once
-
-composing.speed_up()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

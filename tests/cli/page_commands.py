@@ -33,7 +33,7 @@ RUN_ELSEWHERE = (
     # What a command has, why it does not run here, and the tests of its kind.
     (r"demo$", "three trainings of the command train, which are replaced there", "tests/cli/test_demo.py"),
     (r"train resume=RUN", "needs a run that was interrupted", "tests/cli/test_resume.py"),
-    (r"hydra/launcher=joblib", "starts processes", "tests/cli/test_signals.py"),
+    (r"hydra/launcher=joblib", "starts processes", "tests/cli/test_killed_sweep.py"),
     (r"hydra/launcher=submitit", "needs a cluster", "tests/cli/test_submitit.py"),
     (r"trainer=ddp", "starts processes", "tests/cli/test_several_processes.py"),
     (r"train \+sweep=(?!tiny|NAME)", "takes hours; every job is composed", "tests/cli/test_sweep.py"),

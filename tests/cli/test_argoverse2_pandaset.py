@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestreet.cli.data import data
+from sparsestreet.cli.commands.data import data
 from tests.data.argoverse2.write import write_log
 from tests.data.pandaset.write import PandaPlan, write_sequence
 from tests.data.plan import Plan

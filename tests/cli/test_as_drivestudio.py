@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.cli.compose import override_problem
+from sparsestreet.cli.config.validate import override_problem
 from sparsestreet.ops import SplatSettings
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY

@@ -12,14 +12,13 @@ from lightning import Callback
 from lightning.pytorch.loggers import CSVLogger
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli import evaluate as evaluate_module
-from sparsestreet.cli import run as run_module
-from sparsestreet.cli import step as step_module
-from sparsestreet.cli.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of
-from sparsestreet.cli.compose import resolved
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.run import run
-from sparsestreet.cli.step import NEVER, train_with
+from sparsestreet.cli.commands import evaluate as evaluate_module
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.config.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of
+from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.runs import run as run_module
+from sparsestreet.cli.runs import run as step_module
+from sparsestreet.cli.runs.run import NEVER, run, train_with
 from sparsestreet.data.synthetic.reader import StreetReader
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.auto import found_option, with_found_data
-from sparsestreet.cli.compose import CONF
-from sparsestreet.cli.data import data
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.compose import CONF
+from sparsestreet.cli.config.log_from_options import found_option, with_found_data
 from tests.cli.configurations import composed
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 

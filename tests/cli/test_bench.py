@@ -10,9 +10,9 @@ from sparsestreet.bench import blend, data, figures, gpu, knobs, masks, scaling,
 from sparsestreet.bench.refine import enlarged
 from sparsestreet.bench.scenes import Size
 from sparsestreet.bench.timing import TimingBudget
-from sparsestreet.cli import bench as cli_bench
-from sparsestreet.cli import step as cli_step
-from sparsestreet.cli.bench import bench, trained_street
+from sparsestreet.cli.commands import bench as cli_bench
+from sparsestreet.cli.commands.bench import bench, trained_street
+from sparsestreet.cli.runs import run as cli_step
 from sparsestreet.geometry.cameras import project
 from sparsestreet.ops import splat
 from sparsestreet.ops.triton.tuning import Tuning

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from sparsestreet.bench import accuracy
-from sparsestreet.cli import check as command
-from sparsestreet.cli.check import PARTS, check
+from sparsestreet.cli.commands import gpu_check as command
+from sparsestreet.cli.commands.gpu_check import PARTS, check
 
 
 @pytest.fixture

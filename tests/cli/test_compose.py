@@ -10,10 +10,9 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import sparsestreet.training.run  # noqa: F401 - its import takes seconds, which are of no test
-from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import as_typed, composed, configuration, load_run_config, override_problem, value_of
-from sparsestreet.cli.limits import LOGGER_PACKAGES
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.compose import as_typed, composed, configuration, load_run_config, value_of
+from sparsestreet.cli.config.validate import LOGGER_PACKAGES, config_problem, override_problem
 from tests.typed import there
 
 
@@ -41,6 +40,7 @@ def test_flags_of_hydra_and_their_words_pass(flags):
         (["trainer.fast_dev_runx=true"], "did you mean 'trainer.fast_dev_run'"),
         (["data.log.min_lens_shift=0.5"], "no key 'data.log.min_lens_shift': it is 'effects.lens.min_shift' now"),
         (["schedule.max_step=5"], "did you mean 'schedule.max_steps'"),
+        (["capacity=huge"], "no option 'huge' in conf/capacity: choose one of paper, small"),
         (["nod.background.num_points=5"], "did you mean 'node.background.num_points'"),
         (
             ["sparsify=papr"],
@@ -129,7 +129,7 @@ def test_a_folder_that_would_lead_nowhere_is_refused():
 
 def test_the_first_checks_import_no_torch():
     code = (
-        "import sys; from sparsestreet.cli.train import train; status = train(['schedule.max_steps=0'])\n"
+        "import sys; from sparsestreet.cli.commands.train import train; status = train(['schedule.max_steps=0'])\n"
         "assert status == 2 and not {'torch', 'lightning'} & set(sys.modules), status"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
@@ -173,7 +173,6 @@ def test_flags_that_cannot_be_are_one_line(arguments, said, capsys):
         ("evaluation.presets=[fast,1,fast,fast,fast,fast,fast,fast,fast]", "evaluation.presets must be"),
         ("data.lidar.dropout=often", "data.lidar.dropout must be float, got 'often'"),
         ("data.lidar=hdl64", "data.log.settings.lidar must be LidarSensor, got 'hdl64'"),
-        ("capacity=huge", "no capacity 'huge': choose one of small, paper"),
         ("data=drivestudio", "data.root has no value: give data.root=..."),
         ("trainer.devices=2", "training runs on one device, got trainer.devices=2"),
     ],
@@ -282,7 +281,7 @@ def test_a_suggestion_is_of_the_choices_that_were_made():
 
 FILES = {
     "defaults: [paper_short, override /loss/mask_sparsity@loss: ramped]": (
-        "sparsify/mine.yaml: 'override /loss/mask_sparsity' needs a group, and conf/loss/mask_sparsity.yaml is a file: "
+        "sparsify/mine.yaml: 'override /loss/mask_sparsity' needs a group, and loss/mask_sparsity is an option: "
         "set loss.mask_sparsity.KEY in your file"
     ),
     "defaults: [paper_short, override /pruning@callback.pruning.rules: removal]": (

@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator
 
 import pytest
 
-from sparsestreet.cli import convert as module
-from sparsestreet.cli.data import data
+from sparsestreet.cli.commands import convert as module
+from sparsestreet.cli.commands.data import data
 from sparsestreet.data.convert import LogFile, partial_folder
 from sparsestreet.data.drivestudio import DriveStudioReader
 from tests.cli.test_data import SMALL

@@ -7,8 +7,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 
-from sparsestreet.cli.compose import CONF
-from sparsestreet.cli.data import data
+from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.config.compose import CONF
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.synthetic import LidarSensor, StreetReader, StreetSettings
 from tests.conftest import unchecked

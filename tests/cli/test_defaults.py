@@ -1,27 +1,34 @@
-"""What a training from Python starts from unless it is told otherwise is what conf/ says."""
+"""A training from Python starts from what the command starts from: the defaults of the classes and of conf/ are one."""
 
 import inspect
+from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 import pytest
-from hydra import compose
 from hydra.utils import get_object
 from lightning import Trainer
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.assemble import recipe_of, trainer_of
-from sparsestreet.cli.compose import configuration
+from sparsestreet.cli.config.assemble import recipe_of, trainer_of
+from sparsestreet.cli.config.compose import composed
+from sparsestreet.scene import effects
+from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings, RigidSettings
+from sparsestreet.training.callbacks import DensityControl, PhaseTimes, RowLedger
+from sparsestreet.training.losses import Depth, Photometric, SkyMask
 from sparsestreet.training.moved_views import MovedViews
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.run import CPU_TRAINER
+from sparsestreet.training.schedule import Interval
+from sparsestreet.triangulation import ImagePointSettings
 from tests.typed import as_a
 
 
 @pytest.fixture(scope="module")
 def cfg():
-    with configuration():
-        return compose("train", ["folder=.", "schedule=paper", "sparsify=masks"])
+    return composed(["schedule=paper", "sparsify=masks"])
 
 
 def test_the_trainer(cfg):
@@ -32,26 +39,62 @@ def test_the_trainer(cfg):
     assert configured.keywords == CPU_TRAINER.keywords | plain
 
 
-def test_learning_rates_and_sources(cfg):
-    nodes = recipe_of(cfg).nodes
-    assert RigidSettings().learning_rates == nodes["rigid"].learning_rates
-    usual, configured = BackgroundSettings(), as_a(BackgroundSettings, nodes["background"])
-    assert usual.learning_rates.items() >= configured.learning_rates.items()
-    assert usual.sources == configured.sources
-    assert usual.num_points == configured.num_points
-    assert (usual.prunable, usual.masked) == (configured.prunable, configured.masked)
+def streetgs() -> Recipe:
+    """StreetGS in Python: parts by their names, and of their numbers those alone that have no default."""
+    control = DensityControl(Interval(0.04, 0.9, 100), 0.36, Interval(0.0, 0.0, 1000))
+    return Recipe(
+        nodes={
+            "background": BackgroundSettings(
+                mask=StaticMaskSettings(sparsity_weight=2.5e-3), masked=False, density=GradientDensity()
+            ),
+            "rigid": RigidSettings(
+                classes=["Vehicle"],
+                mask=StaticMaskSettings(sparsity_weight=1e-4, visible_only=True),
+                masked=False,
+                density=GradientDensity(cull_scale=0.1),
+            ),
+        },
+        effects={
+            "hood": effects.HoodSettings(),
+            "sky": effects.SkySettings(),
+            "lens": effects.LensSettings(),
+            "shutter": effects.ShutterSettings(),
+            "exposure": effects.ExposureSettings(),
+            "affine": effects.AffineSettings(),
+            "camera_poses": effects.CameraPosesSettings(),
+            "box_poses": effects.BoxPosesSettings(),
+            "motion_blur": effects.MotionBlurSettings(),
+            "dirt": effects.DirtSettings(),
+            "night": effects.NightSettings(),
+            "saturation": effects.SaturationSettings(),
+        },
+        losses={"photometric": Photometric(), "sky": SkyMask(), "depth": Depth()},
+        callbacks={
+            "density_control": control,
+            "row_ledger": RowLedger(Path("records/counts.csv")),
+            "phase_times": PhaseTimes(Path("records/phases.csv")),
+        },
+        image_points=ImagePointSettings(),
+        moved_views=MovedViews(),
+    )
 
 
-def test_moved_views(cfg):
-    assert recipe_of(cfg).moved_views == MovedViews()
-
-
-def test_the_rest_of_a_recipe(cfg):
-    usual, configured = Recipe(nodes={}), recipe_of(cfg)
-    assert usual.optimizer == configured.optimizer
-    assert usual.options == configured.options
-    assert usual.losses["photometric"] == configured.losses["photometric"]
-    assert usual.sh_interval == pytest.approx(configured.sh_interval, rel=2e-3)  # a thirtieth, in four digits there
+def test_streetgs_from_python_is_the_commands():
+    said = recipe_of(composed([]))
+    assert said.image_points is not None
+    # The folder in which runs share points, and a limit that says what its absence means, are the command's.
+    losses = {**said.losses, "depth": replace(as_a(Depth, said.losses["depth"]), nearest_rendered=None)}
+    said = replace(said, losses=losses, image_points=replace(said.image_points, cache=None))
+    usual = streetgs()
+    for entry in fields(Recipe):
+        if entry.name != "callbacks":
+            assert getattr(usual, entry.name) == getattr(said, entry.name), entry.name
+    assert usual.callbacks.keys() == said.callbacks.keys()
+    for name, callback in usual.callbacks.items():
+        own, other = vars(callback), vars(said.callbacks[name])
+        assert {key: own[key] for key in own if isinstance(own[key], int | float | bool | Interval)} == {
+            key: other[key] for key in own if isinstance(own[key], int | float | bool | Interval)
+        }
 
 
 def values(tree: Any, found: dict[str, tuple[Any, list]]) -> None:
@@ -77,24 +120,13 @@ def alike(usual: Any, given: Any) -> bool:
 
 
 DIFFERENT = {
-    "AffineSettings.when",
-    "BackgroundSettings.min_gaussians",
     "DeformableSettings.has_body_pose",
     "DeformableSettings.min_displacement",
     "DeformableSettings.min_gaussians",
-    "DeformableSettings.min_instance_gaussians",
-    "DensityControl.pause_after_reset",
     "Depth.nearest_rendered",
-    "FieldSettings.max_gaussians",
-    "FieldSettings.min_gaussians",
     "ImagePointSettings.cache",
-    "ImagePoints.initial_opacity",
-    "RigidSettings.min_displacement",
-    "RigidSettings.min_gaussians",
-    "RigidSettings.min_instance_gaussians",
-    "SkySettings.resolution",
+    "MaskSparsity.weight",
     "SmplSettings.min_gaussians",
-    "SmplSettings.min_instance_gaussians",
     "SmplSettings.sh_degree",
     "VibratingDensity.split_scale",
     "VibratingSettings.max_gaussians",
@@ -108,9 +140,8 @@ def test_every_option_of_the_parts():
     found: dict[str, tuple[Any, list]] = {}
     losses = "loss=[photometric,sky,depth,mask_sparsity,opacity_entropy,inverse_depth_smoothness,dynamic_region]"
     for method, capacity in (("omnire", "paper"), ("omnire", "small"), ("pvg", "paper"), ("deformgs", "small")):
-        chosen = ["folder=.", "schedule=paper", f"capacity={capacity}", f"method={method}", "sparsify=masks", losses]
-        with configuration():
-            values(OmegaConf.to_container(compose("train", chosen), resolve=True), found)
+        chosen = [f"capacity={capacity}", f"method={method}", "sparsify=masks", losses]
+        values(OmegaConf.to_container(composed(chosen), resolve=True), found)
     assert len(found) > 150
     same = {option for option, (usual, given) in found.items() if any(alike(usual, one) for one in given)}
     assert found.keys() - same == DIFFERENT

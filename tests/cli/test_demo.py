@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from sparsestreet.cli import demo as module
-from sparsestreet.cli.demo import demo
+from sparsestreet.cli.commands import demo as module
+from sparsestreet.cli.commands.demo import demo
 from sparsestreet.pictures.images import KINDS, picture_path, write_png
 from sparsestreet.records.quality import HELD_OUT, QUALITY
 from sparsestreet.records.summary import SUMMARY

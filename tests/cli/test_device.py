@@ -8,11 +8,12 @@ import torch
 from lightning import Trainer
 from omegaconf import OmegaConf
 
-from sparsestreet.cli import device as device_module
-from sparsestreet.cli.assemble import trainer_of
-from sparsestreet.cli.device import device_of, device_problem, devices_of_job
-from sparsestreet.cli.evaluate import _device
-from sparsestreet.cli.scene import open_scene
+from sparsestreet.cli.commands.evaluate import _device
+from sparsestreet.cli.commands.scenes import open_scene
+from sparsestreet.cli.config.assemble import trainer_of
+from sparsestreet.cli.config.validate import device_of, device_problem
+from sparsestreet.cli.runs import devices as device_module
+from sparsestreet.cli.runs.devices import devices_of_job
 from tests.cli.configurations import composed
 from tests.evaluation.frames import make_run
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from sparsestreet.cli.compose import composed
-from sparsestreet.cli.effect_words import with_effect_keys
+from sparsestreet.cli.config.compose import composed
+from sparsestreet.cli.config.validate import with_effect_keys
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestreet.cli.effects import effects
+from sparsestreet.cli.commands.effects import effects
 
 
 def test_the_plan_of_a_street(tiny_street, tmp_path, capsys):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.cli.evaluate import Options, evaluate, extra_words
+from sparsestreet.cli.commands.evaluate import Options, evaluate, extra_words
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
 

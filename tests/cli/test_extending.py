@@ -11,10 +11,10 @@ import torch
 from hydra.errors import InstantiationException
 from PIL import Image
 
-from sparsestreet.cli.assemble import data_of, recipe_of
-from sparsestreet.cli.compose import override_problem
-from sparsestreet.cli.data import data
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.assemble import data_of, recipe_of
+from sparsestreet.cli.config.validate import override_problem
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.pruning import RenderContext
 from sparsestreet.records.run import RUN

@@ -11,13 +11,13 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli import folder
-from sparsestreet.cli.compose import composed, resolved
-from sparsestreet.cli.folder import OF_A_RUN, folder_problem, leave_folder, start_of, take_folder
-from sparsestreet.cli.locks import sole_writer
-from sparsestreet.cli.resume import resumed_overrides
-from sparsestreet.cli.sweep import run_job
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.compose import composed, resolved
+from sparsestreet.cli.runs import folder
+from sparsestreet.cli.runs.folder import OF_A_RUN, folder_problem, leave_folder, start_of, take_folder
+from sparsestreet.cli.runs.locks import sole_writer
+from sparsestreet.cli.runs.resume import resumed_overrides
+from sparsestreet.cli.runs.sweep import run_job
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.records.configuration import flat_config
@@ -175,7 +175,9 @@ def test_a_refused_run_is_left_as_it_is(tmp_path, capsys):
 def test_hydra_leads_nowhere_else(tmp_path, capsys, monkeypatch):
     """``hydra.run.dir`` names the folder behind the back of ``out``."""
     out = a_run(tmp_path / "run")
-    monkeypatch.setattr("sparsestreet.cli.train._problem_of_values", lambda words: None)  # half of the test's time
+    monkeypatch.setattr(
+        "sparsestreet.cli.commands.train._problem_of_values", lambda words: None
+    )  # half of the test's time
     with pytest.raises(SystemExit):
         train(["sparsify=paper", f"hydra.run.dir={out}"])
     assert "holds another run" in capsys.readouterr().err

@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestreet.cli.assemble import recipe_of, with_images
+from sparsestreet.cli.config.assemble import recipe_of, with_images
 from sparsestreet.training.callbacks import DensityControl
 from tests.cli.configurations import composed
 from tests.typed import as_a

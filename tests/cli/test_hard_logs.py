@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.cli.assemble import recipe_of
+from sparsestreet.cli.config.assemble import recipe_of
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Sweeps
 from sparsestreet.data.log import DrivingLog

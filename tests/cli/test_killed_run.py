@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
 from sparsestreet.training.callbacks import RowLedger
 from tests.cli.conftest import TINY_RIGID
 from tests.cli.test_killed_sweep import content

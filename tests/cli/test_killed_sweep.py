@@ -34,7 +34,7 @@ def sweep(folder: Path, street: list[str]) -> list[str]:
         "+sweep=tiny", *street, "data.log.settings.seed=0", *TIMED_ONCE,
         f"hydra.sweep.dir={folder}", "hydra.sweep.subdir=${name}_${seed}",
         "hydra/launcher=joblib", "hydra.launcher.n_jobs=2",
-        "sparsify=none,removal", "seed=0,1,2,3,4,5", "schedule.max_steps=200", "checkpoint_every=10", "reuse=false",
+        "sparsify=none,removal", "seed=0,1,2,3,4,5", "schedule.max_steps=200", "checkpoint_every=10",
     ]  # fmt: skip
 
 
@@ -92,3 +92,25 @@ def test_a_sweep_killed_at_random_ends_as_an_undisturbed_one(tiny_street, tmp_pa
     assert len([name for name in expected if name.endswith("summary.json")]) == JOBS
     assert sorted(expected) == sorted(got)
     assert [name for name in expected if expected[name] != got[name]] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("to_all", "number"), [(True, signal.SIGINT), (False, signal.SIGTERM)])
+def test_a_sweep_that_a_signal_ends_leaves_no_process_behind(tiny_street, tmp_path, to_all, number):
+    """Ctrl-C reaches all processes, a cluster's signal perhaps the first alone. Jobs go on from checkpoints."""
+    street = [word for word in tiny_street if word.startswith(("data.", "image_points."))]
+    command = [*sweep(tmp_path, street), "schedule.max_steps=2000"]
+    process = subprocess.Popen(
+        command, env={**os.environ, "OMP_NUM_THREADS": "1"}, start_new_session=True, stderr=subprocess.PIPE, text=True
+    )
+    while len(list(tmp_path.glob("*/checkpoints/last.ckpt"))) < 2:
+        assert process.poll() is None, process.communicate()[1]
+        time.sleep(0.1)
+    (os.killpg if to_all else os.kill)(process.pid, number)
+    _, errors = process.communicate(timeout=120)
+    assert process.returncode == 128 + number, errors
+    with pytest.raises(ProcessLookupError):  # the group has no process any more
+        for _ in range(100):
+            os.killpg(process.pid, 0)
+            time.sleep(0.1)
+    assert not list(tmp_path.glob("*/records/summary.json"))

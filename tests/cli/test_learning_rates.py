@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestreet.cli.assemble import recipe_of
+from sparsestreet.cli.config.assemble import recipe_of
 from sparsestreet.scene.learning_rate import LearningRate, matching_rate
 from tests.cli.configurations import composed
 

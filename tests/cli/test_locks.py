@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from sparsestreet.cli.locks import LOCK, FolderTakenError, hold, let_go, sole_writer
+from sparsestreet.cli.runs.locks import LOCK, FolderTakenError, acquire, release, sole_writer
 
 
 def test_a_second_writer_is_told_who_the_first_is_and_touches_nothing(tmp_path):
@@ -38,22 +38,22 @@ def test_a_failed_writer_leaves_no_lock(tmp_path):
 
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
     """Its file is still there; a link in its place is no way to another file."""
-    code = "import sys, time; from sparsestreet.cli.locks import hold; from pathlib import Path; "
-    code += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    code = "import sys, time; from sparsestreet.cli.runs.locks import acquire; from pathlib import Path; "
+    code += "acquire(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
     path = tmp_path / "slot"
     process = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "held\n"
-    assert hold(path) is None
+    assert acquire(path) is None
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert path.exists()
-    held = hold(path)
+    held = acquire(path)
     assert held is not None
-    let_go(path, held)
+    release(path, held)
     assert not path.exists()
     path.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OSError, match="slot"):
-        hold(path)
+        acquire(path)
     assert not (tmp_path / "elsewhere").exists()
 
 
@@ -68,8 +68,8 @@ def test_a_lock_whose_file_was_removed_in_between_is_taken_anew(tmp_path, monkey
         taken.append(descriptor)
 
     monkeypatch.setattr("fcntl.flock", late)
-    held = hold(path)
+    held = acquire(path)
     assert held is not None
     assert len(taken) == 2
-    assert hold(path) is None
-    let_go(path, held)
+    assert acquire(path) is None
+    release(path, held)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import pytest
 
 from sparsestreet.cli import READER_GONE, main
-from sparsestreet.cli.options import run_command
+from sparsestreet.cli.commands.options import run_command
 
 PROGRAM = [sys.executable, "-m", "sparsestreet"]
 

@@ -1,7 +1,7 @@
 """Which trainings look beside the path, and how hard."""
 
-from sparsestreet.cli.assemble import recipe_of
-from sparsestreet.cli.compose import resolved
+from sparsestreet.cli.config.assemble import recipe_of
+from sparsestreet.cli.config.compose import resolved
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.training.moved_views import MovedViews
 from tests.cli.configurations import composed

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet import load_scene
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Deformable, Field, Smpl
 from tests.typed import as_a

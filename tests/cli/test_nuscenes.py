@@ -3,7 +3,7 @@
 import pytest
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.data import data
+from sparsestreet.cli.commands.data import data
 from tests.cli.configurations import composed
 from tests.data.nuscenes.written import write_nuscenes
 from tests.data.plan import Plan

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparsestreet.cli.objects import objects
-from sparsestreet.cli.render import render
+from sparsestreet.cli.commands.objects import objects
+from sparsestreet.cli.commands.render import render
 from sparsestreet.export.objects import scene_objects
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.storage import save_scene

@@ -4,8 +4,9 @@ from typing import Any
 
 import pytest
 
-from sparsestreet.cli.assemble import recipe_of
-from sparsestreet.cli.compose import CONF, resolved
+from sparsestreet.cli.config.assemble import recipe_of
+from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.config.option_files import options_of
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, LightGaussianRule, MiniSplattingRule
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.density import GradientDensity, McmcDensity
@@ -13,7 +14,7 @@ from sparsestreet.training.callbacks import Pruning
 from tests.cli.configurations import composed
 from tests.typed import as_a
 
-RULES = sorted(path.stem for path in (CONF / "experiment" / "rule").glob("*.yaml"))
+RULES = options_of("experiment/rule")
 NAMES = ("name", "out", "sparsify.")
 MOMENTS = ["[0.93334]", "[0.6]", "[0.4,0.5,0.6]"]
 
@@ -51,7 +52,7 @@ def test_a_moment_is_in_the_name():
 def test_uncapped_is_plain_without_limits(method: str):
     nodes = recipe_of(composed(f"method={method}", "sparsify=uncapped")).nodes
     assert {settings.max_gaussians for settings in nodes.values()} == {None}
-    apart = (*NAMES, *(f"node.{name}.max_gaussians" for name in nodes))
+    apart = (*NAMES, "capacity.", *(f"node.{name}.max_gaussians" for name in nodes))
     assert without(apart, f"method={method}", "sparsify=uncapped") == without(apart, f"method={method}")
 
 

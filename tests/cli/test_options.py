@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from sparsestreet.cli.options import OptionError, parse_options, run_command, unknown_key
+from sparsestreet.cli.commands.options import OptionError, parse_options, run_command, unknown_key
 
 
 @dataclass(frozen=True)

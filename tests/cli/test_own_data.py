@@ -6,8 +6,8 @@ import pytest
 import yaml
 from hydra.utils import get_class
 
-from sparsestreet.cli.compose import CONF
-from sparsestreet.cli.data import data
+from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.config.compose import CONF
 from tests.data.colmap.write import write_colmap
 from tests.data.nerfstudio.write import write_nerfstudio
 from tests.data.plan import Plan

@@ -10,10 +10,9 @@ from types import ModuleType
 import pytest
 import torch
 
-from sparsestreet.cli import COMMANDS
-from sparsestreet.cli.compose import override_problem
-from sparsestreet.cli.effect_words import with_effect_keys
-from sparsestreet.cli.options import OptionError, parse_options
+from sparsestreet.cli import COMMANDS, MODULES
+from sparsestreet.cli.commands.options import OptionError, parse_options
+from sparsestreet.cli.config.validate import override_problem, with_effect_keys
 from sparsestreet.data.drivestudio import DriveStudioReader
 from tests.cli.page_commands import RUN_ELSEWHERE, SHOWN, commands_of, elsewhere
 from tests.conftest import unchecked
@@ -39,7 +38,7 @@ def problem_of(command: str) -> str | None:
         words = [word for word in words if "=" in word or word.startswith("-")] if name == "data" else words
         several = ["-m"] if any(word.startswith("+sweep=") for word in words) else []
         return override_problem(with_effect_keys([*several, *words]))
-    module = importlib.import_module(f"sparsestreet.cli.{name}")
+    module = importlib.import_module(f"sparsestreet.cli.commands.{MODULES.get(name, name)}")
     with pytest.MonkeyPatch.context() as patch:
         return _bench_problem(module, words, patch) if name == "bench" else _option_problem(module, name, words, patch)
 

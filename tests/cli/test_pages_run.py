@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from sparsestreet.bench import knobs, planted, sweep
-from sparsestreet.cli.export import export
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.export import export
+from sparsestreet.cli.commands.train import train
 from sparsestreet.scene.edits import objects_of
 from sparsestreet.scene.storage import load_scene
 from tests.cli.conftest import TIMED_ONCE, TINY_NODES, TINY_RIGID, method_of

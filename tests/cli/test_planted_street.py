@@ -14,9 +14,9 @@ from jaxtyping import Bool
 from lightning import Trainer
 from torch import Tensor
 
-from sparsestreet.cli.assemble import data_of
-from sparsestreet.cli.compose import load_run_config
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.config.assemble import data_of
+from sparsestreet.cli.config.compose import load_run_config
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, RenderContext
 from sparsestreet.scene.gaussians import Rows

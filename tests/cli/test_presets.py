@@ -5,15 +5,15 @@ from typing import Any
 
 import pytest
 
-from sparsestreet.cli.assemble import recipe_of
-from sparsestreet.cli.checks import config_problem
-from sparsestreet.cli.compose import resolved
-from sparsestreet.cli.preset import preset_notes
-from sparsestreet.cli.upstream import alternatives, compare, pairs
+from sparsestreet.cli.commands.presets import pairs, rows_of
+from sparsestreet.cli.config.assemble import recipe_of
+from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.config.validate import config_problem, preset_notes
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.training.callbacks import DensityControl, Pruning
 from sparsestreet.training.schedule import Course, Interval, milestone
 from tests.cli.configurations import composed
+from tests.cli.test_upstream import alternatives
 from tests.typed import as_a
 
 FULL = ("schedule=paper", "capacity=paper")
@@ -196,11 +196,11 @@ def test_what_is_of_another_form_or_of_no_key_is_upstreams(preset: str, method: 
 @pytest.mark.parametrize(("preset", "method"), PAIRS)
 def test_rates_fall_and_scale_where_upstreams_do(preset: str, method: str):
     """No key of upstream's says that a rate is constant, or none of the scene's radius."""
-    rows = {row.key: row for row in compare(preset, method).rows if row.ours}
+    rows = {row.key: row for row in rows_of(preset, method) if row.ours != "-"}
     found = flat(preset, method)
     for key, row in rows.items():
         if key.endswith(".lr"):
-            for rate in (ours.removesuffix(".initial") for ours in alternatives(row.ours or "")):
+            for rate in (ours.removesuffix(".initial") for ours in alternatives(row.ours)):
                 assert (f"{rate}.final" in found) == (f"{key}_final" in rows), rate
                 scale = rows.get(f"{key.removesuffix('lr')}scale_factor")
                 by_radius = scale is not None and scale.upstream == "scene_radius"
@@ -281,10 +281,10 @@ def test_what_is_lacking_is_said_in_plain_words():
     assert any(key.startswith("preset.absent.") for key in flat("drivestudio", "pvg"))
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "method"),
-    [("drivestudio_legacy", "omnire"), pytest.param("drivestudio", "pvg", marks=pytest.mark.slow)],
+    [("drivestudio_legacy", "omnire"), ("drivestudio", "pvg")],
 )
 def test_a_preset_trains_and_says_what_it_is(preset: str, method: str, run_train, tmp_path, capsys):
     """Every part of it: smaller images first, density control, all terms."""

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from sparsestreet.cli.process import SPINS, follows_another, name_beside_first, speak_as, wait_politely
+from sparsestreet.cli.process import SPINS, is_worker_rank, name_beside_first, set_log_prefix, use_passive_wait
 
 
 @pytest.mark.parametrize(
@@ -19,7 +19,7 @@ def test_threads_sleep_unless_the_environment_says_otherwise(monkeypatch, given,
         monkeypatch.delenv(name)
     for name, value in given.items():
         monkeypatch.setenv(name, value)
-    wait_politely()
+    use_passive_wait()
     assert os.environ.get("GOMP_SPINCOUNT") == expected
 
 
@@ -28,11 +28,11 @@ def test_the_first_process_of_a_run_follows_nobody(name, monkeypatch):
     """Nor does any that shares no run: a cluster numbers jobs that know nothing of each other as well."""
     for one in ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID"):
         monkeypatch.setenv(one, "0")
-    assert not follows_another({"strategy": "ddp"})
+    assert not is_worker_rank({"strategy": "ddp"})
     monkeypatch.setenv(name, "1")
-    assert follows_another({"strategy": "ddp"})
+    assert is_worker_rank({"strategy": "ddp"})
     for alone in ({}, {"strategy": "auto"}, {"strategy": None}):
-        assert not follows_another(alone)
+        assert not is_worker_rank(alone)
 
 
 DDP = {"strategy": {"_target_": "sparsestreet.training.parallel.DataParallel"}}
@@ -55,7 +55,7 @@ def test_processes_of_a_run_have_names(environment, name, monkeypatch):
     for variable, value in environment.items():
         monkeypatch.setenv(variable, value)
     assert name_beside_first(DDP) == name
-    assert follows_another(DDP) == (name is not None)
+    assert is_worker_rank(DDP) == (name is not None)
     assert name_beside_first({"strategy": "auto"}) is None  # a job of a cluster that trains alone
 
 
@@ -65,7 +65,7 @@ def test_only_the_first_process_speaks_below_warnings(monkeypatch):
     monkeypatch.setattr(logging.getLogger(), "handlers", [logging.StreamHandler(stream) for stream in said])
     level = logging.getLogger("lightning.fabric").level
     try:
-        speak_as("process 2")
+        set_log_prefix("process 2")
         log = logging.getLogger("sparsestreet.test")
         log.setLevel(logging.INFO)
         log.info("node 'rigid' takes 5 Vehicle")

@@ -8,8 +8,8 @@ from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.compose import CONF, composed, configuration
-from sparsestreet.cli.named_log import UsageError, configured_log
+from sparsestreet.cli.config.compose import CONF, composed, configuration
+from sparsestreet.cli.config.log_from_options import UsageError, configured_log
 
 PROTOCOLS = sorted(path.stem for path in (CONF / "protocol").glob("*.yaml"))
 OMNIRE = {

@@ -14,9 +14,9 @@ import torch
 from hydra.utils import instantiate
 from PIL import Image
 
-from sparsestreet.cli import scene
-from sparsestreet.cli.compose import load_run_config
-from sparsestreet.cli.render import USAGE, RenderRequest, render
+from sparsestreet.cli.commands import scenes
+from sparsestreet.cli.commands.render import USAGE, RenderRequest, render
+from sparsestreet.cli.config.compose import load_run_config
 from sparsestreet.export import rig, video
 from sparsestreet.export.layers import LAYERS, layer_values
 from sparsestreet.export.path import recorded, resized, shifted
@@ -190,7 +190,7 @@ def test_without_a_file_the_usage_is_said(run, capsys):
 
 
 def test_another_ending_is_refused_before_torch_is_there(run, tmp_path):
-    code = "import sys; from sparsestreet.cli.render import render; status = render(sys.argv[1:])"
+    code = "import sys; from sparsestreet.cli.commands.render import render; status = render(sys.argv[1:])"
     code += "; sys.exit(99 if 'torch' in sys.modules else status)"
     done = subprocess.run(
         [sys.executable, "-c", code, str(run), str(tmp_path / "out.avi")], capture_output=True, text=True
@@ -257,7 +257,7 @@ def test_everything_that_is_asked_for_arrives(run, tmp_path, monkeypatch, capsys
     write_views(run / "views.json", views.training, views.held_out, frame_rate=4.0)
     opened, given = [], {}
     stored = stored_street()
-    monkeypatch.setattr(scene, "open_scene", lambda *place: opened.append(place) or stored)
+    monkeypatch.setattr(scenes, "open_scene", lambda *place: opened.append(place) or stored)
     monkeypatch.setattr(video, "path_pictures", lambda *told: given.update(path=told) or iter(()))
     monkeypatch.setattr(video, "write_pictures", lambda *told, **how: given.update(written=(told, how)) or 77)
     assert render([f"scene={run}", f"out={tmp_path / 'o'}", "cameras=[2,0]", *words]) == 0

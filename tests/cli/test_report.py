@@ -5,7 +5,7 @@ import typing
 
 import pytest
 
-from sparsestreet.cli.report import ReportRequest, report
+from sparsestreet.cli.commands.report import ReportRequest, report
 from sparsestreet.metrics.protocols import PROTOCOLS
 from sparsestreet.records.summary import SUMMARY
 from tests.evaluation.frames import make_summary

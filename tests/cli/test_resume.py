@@ -14,10 +14,10 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.branch import check_resumed
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.resume import resumed_overrides
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.runs.resume import resumed_overrides
+from sparsestreet.cli.runs.shared_prefix import check_resumed
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.training.callbacks import RowLedger
@@ -79,6 +79,7 @@ def stopped_early(tiny_street, tmp_path_factory) -> Path:
     return stopped_at(23, tiny_street, tmp_path_factory.mktemp("stopped") / "run")
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_can_be_evaluated(stopped_early, tmp_path):
     shutil.copytree(stopped_early, tmp_path / "run")
     assert evaluate([f"run={tmp_path / 'run'}"]) == 0

@@ -4,14 +4,14 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from sparsestreet.cli import scene
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.export import export
-from sparsestreet.cli.objects import objects
-from sparsestreet.cli.render import render
-from sparsestreet.cli.scene import open_scene
-from sparsestreet.cli.serve import serve
-from sparsestreet.cli.view import view
+from sparsestreet.cli.commands import scenes
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.export import export
+from sparsestreet.cli.commands.objects import objects
+from sparsestreet.cli.commands.render import render
+from sparsestreet.cli.commands.scenes import open_scene
+from sparsestreet.cli.commands.serve import serve
+from sparsestreet.cli.commands.view import view
 from sparsestreet.export.ply import scene_gaussians, write_ply
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
@@ -66,9 +66,9 @@ def test_a_scene_opens_where_it_is_asked_for(tmp_path, monkeypatch, gpu, asked):
     """Of a run its configuration is looked at first; a file alone says nothing of them."""
     done: list[object] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: gpu)
-    monkeypatch.setattr(scene, "open_run_config", lambda run, parts: done.append((run, *parts)))
+    monkeypatch.setattr(scenes, "open_run_config", lambda run, parts: done.append((run, *parts)))
     stored = stored_street()
-    monkeypatch.setattr(scene, "load_scene", lambda *given: done.append(given) or stored)
+    monkeypatch.setattr(scenes, "load_scene", lambda *given: done.append(given) or stored)
     (tmp_path / "run" / ".hydra").mkdir(parents=True)
     device = asked or ("cuda" if gpu else "cpu")
     if device == "cuda" and not gpu:

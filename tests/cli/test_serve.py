@@ -8,8 +8,8 @@ from dataclasses import fields
 
 import pytest
 
-from sparsestreet.cli.export import export
-from sparsestreet.cli.serve import USAGE, ServeRequest, serve
+from sparsestreet.cli.commands.export import export
+from sparsestreet.cli.commands.serve import USAGE, ServeRequest, serve
 from tests.serving.street import write_run
 
 

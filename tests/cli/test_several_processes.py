@@ -10,7 +10,7 @@ import torch
 from hydra.utils import instantiate
 from lightning import Trainer
 
-from sparsestreet.cli.assemble import data_of, recipe_of, with_views
+from sparsestreet.cli.config.assemble import data_of, recipe_of, with_views
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.training.callbacks import RowLedger

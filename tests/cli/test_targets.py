@@ -11,18 +11,19 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from sparsestreet.cli import COMMANDS, targets
-from sparsestreet.cli.bench import bench
-from sparsestreet.cli.compose import CONF, TrainSchema
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.export import export
-from sparsestreet.cli.objects import objects
-from sparsestreet.cli.render import render
-from sparsestreet.cli.resume import resumed_overrides
-from sparsestreet.cli.serve import serve
-from sparsestreet.cli.targets import check_received, leaves, made, named_by_conf, open_run_config
-from sparsestreet.cli.train import train
-from sparsestreet.cli.view import view
+from sparsestreet.cli import COMMANDS
+from sparsestreet.cli.commands.bench import bench
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.export import export
+from sparsestreet.cli.commands.objects import objects
+from sparsestreet.cli.commands.render import render
+from sparsestreet.cli.commands.serve import serve
+from sparsestreet.cli.commands.train import train
+from sparsestreet.cli.commands.view import view
+from sparsestreet.cli.config import option_files, targets
+from sparsestreet.cli.config.compose import CONF, TrainSchema
+from sparsestreet.cli.config.targets import check_received, leaves, made, named_by_conf, open_run_config
+from sparsestreet.cli.runs.resume import resumed_overrides
 from tests.cli.configurations import composed
 
 
@@ -62,7 +63,7 @@ def attacks(mark: str) -> list[dict[str, Any]]:
         {"_target_": "omegaconf.OmegaConf.save", "config": {}, "f": mark},
         {"_target_": "sparsestreet.cli.main", "arguments": ["bench", "--out", mark]},
         {"_target_": "sparsestreet.records.strict_json.write_json", "path": path, "value": 1},
-        {"_target_": "sparsestreet.cli.sweep.SweepFolder"},
+        {"_target_": "sparsestreet.cli.runs.sweep.SweepFolder"},
         {"_target_": "antigravity.geohash", "_args_": [0, 0, mark]},
     ]
 
@@ -74,7 +75,7 @@ WRAPPED: list[Callable[[dict[str, Any]], Any]] = [
     lambda part: {"_target_": "sparsestreet.evaluation.extra.ExtraMetrics", "novel": [1, part]},
     lambda part: {**part, "_target_": "${name}"},
     lambda part: {**part, "_target_": ["os", "system"]},
-    lambda part: "${by_capacity:{small: {_target_: os.mkdir, path: " + "x" + "}}}",
+    lambda part: "${by_drive:{1: {_target_: os.mkdir, path: " + "x" + "}}}",
     lambda part: "${oc.create:'{_target_: os.mkdir}'}",
     lambda part: "${oc.env:HOME}",
     lambda part: "${${name}:HOME}",
@@ -83,7 +84,7 @@ PLACES = ("evaluation", "data.log", "data.log.classes", "node.background", "effe
 
 
 def run_with(folder: Path, place: str, part: Any) -> Path:
-    config = OmegaConf.create({"name": "os.mkdir", "capacity": "small", "folder": "x", "seed": 0})
+    config = OmegaConf.create({"name": "os.mkdir", "folder": "x", "seed": 0})
     OmegaConf.update(config, place, OmegaConf.create(part) if isinstance(part, dict | list) else part)
     (folder / ".hydra").mkdir(parents=True, exist_ok=True)
     for name in ("scene.safetensors", "views.json"):
@@ -138,9 +139,9 @@ def test_every_command_is_among_those_that_are_tried():
 
 def test_nobody_makes_parts_of_a_configuration_that_was_not_looked_at():
     """Who reads a run's configuration by ``load_run_config`` compares it; who makes its parts opens it here."""
-    sources = {path.name: path.read_text() for path in Path(targets.__file__).parent.glob("*.py")}
+    sources = {path.name: path.read_text() for path in Path(targets.__file__).parents[1].rglob("*.py")}
     reads = {name for name, text in sources.items() if "load_run_config" in text}
-    assert reads == {"compose.py", "targets.py", "branch.py", "folder.py", "resume.py"}
+    assert reads == {"compose.py", "targets.py", "shared_prefix.py", "folder.py", "resume.py"}
     makers = r"instantiate\(|_locate\(|get_object\(|located\(|get_class\(|import_module\(|reader_of\(|made\("
     assert {name for name in reads if re.search(makers, sources[name])} == {"targets.py"}
 
@@ -148,7 +149,7 @@ def test_nobody_makes_parts_of_a_configuration_that_was_not_looked_at():
 def test_the_closed_list_has_what_conf_names():
     """Found once more, by the letters; what stands under hydra is no part of a run."""
     found = {name for path in CONF.rglob("*.yaml") for name in re.findall(r"_target_: ([\w.]+)", path.read_text())}
-    assert found - {"sparsestreet.cli.sweep.SweepFolder"} == set(named_by_conf().targets)
+    assert found - {"sparsestreet.cli.runs.sweep.SweepFolder"} == set(named_by_conf().targets)
     assert len(found) > 80
     assert "sparsestreet.scene.body.SmplFile" in found  # a comment offers it
     texts = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
@@ -168,7 +169,8 @@ def test_what_conf_composes_is_fine(words, tmp_path):
 def test_a_class_that_conf_gains_is_known_at_once(tmp_path, monkeypatch):
     (tmp_path / "node").mkdir()
     (tmp_path / "node" / "kite.yaml").write_text("kite: {parts: [{_target_: sparsestreet.scene.Kite}]}\n")
-    monkeypatch.setattr(targets, "CONF", tmp_path)
+    for module in (targets, option_files):
+        monkeypatch.setattr(module, "CONF", tmp_path)
     named_by_conf.cache_clear()
     try:
         assert named_by_conf().targets == {"sparsestreet.scene.Kite": {"node"}}
@@ -230,7 +232,7 @@ def received(folder: Path, *words: str) -> Path:
         ("++folder=/tmp", "no folder"),
         ("++data.root=${oc.env:HOME}", "data.root is .*asks for what conf/ never asks for: write its value"),
         ("++seed='${oc.decode:\"1\"}'", "asks for what"),
-        ("++data.log.x='${by_capacity:{small: {_target_: os.system}}}'", "asks for what"),
+        ("++data.log.x='${by_drive:{1: {_target_: os.system}}}'", "asks for what"),
         ("logger.save_dir=/tmp/elsewhere", "does not choose where it writes or whom it calls"),
         ("++logger.project=theirs", "does not choose where it writes or whom it calls"),
         ("callback.row_ledger.path=/tmp/elsewhere.csv", "does not choose where it writes"),
@@ -269,7 +271,9 @@ def test_a_file_outside_of_conf_reaches_hydra_no_more_than_a_word(package, conte
 def test_words_of_a_received_run_begin_no_sweep(tmp_path, monkeypatch):
     """The values that a sweep varies are composed job by job, where nobody looks any more."""
     run, asked = received(tmp_path / "run", "+sweep=tiny"), []
-    monkeypatch.setattr("sparsestreet.cli.train.override_problem", lambda words: asked.append(words) or "enough")
+    monkeypatch.setattr(
+        "sparsestreet.cli.commands.train.override_problem", lambda words: asked.append(words) or "enough"
+    )
     assert train([f"resume={run}"]) == 2
     assert asked == [["+sweep=tiny", f"resume={run}", f"out={run}"]]
     assert train([f"resume={run}", "+sweep=tiny"]) == 2

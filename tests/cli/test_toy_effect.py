@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from sparsestreet import load_scene
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.render import render
-from sparsestreet.cli.report import report
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.render import render
+from sparsestreet.cli.commands.report import report
+from sparsestreet.cli.commands.train import train
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
@@ -68,6 +68,7 @@ def test_it_is_timed_counted_and_reported(toy_run, capsys):
     assert "streetgs+removal" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_commands_open_it_where_its_module_is_trusted(toy_run, tmp_path, capsys):
     """A run may come from anybody; the user's own command says whose code may run."""
     run = shutil.copytree(toy_run, tmp_path / "run")

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from sparsestreet import load_scene
-from sparsestreet.cli.evaluate import evaluate
-from sparsestreet.cli.report import report
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.report import report
+from sparsestreet.cli.commands.train import train
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.views import read_views
 from tests.cli.toy.bobbing import Bobbing

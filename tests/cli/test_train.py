@@ -14,7 +14,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet import load_scene
-from sparsestreet.cli.evaluate import evaluate
+from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
@@ -155,6 +155,7 @@ def test_run_json_says_what_the_run_is(finished, tiny_street):
     assert run == SUMMARY.read(finished).run
 
 
+@pytest.mark.slow
 def test_held_out_views_are_those_of_the_split(finished, run_train, tmp_path):
     views = read_views(finished / "views.json")
     assert {view.frame_index for view in views.held_out} == {5}
@@ -269,6 +270,7 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, 
     assert "is of an earlier version, its configuration lacks 'evaluation': train it again" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
     with unchecked():
         out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=1")
@@ -291,6 +293,7 @@ def test_training_measures_what_its_configuration_asks_for(brief, finished):
     assert {"novel", "presets"} < COSTS.read(out).phases.keys()
 
 
+@pytest.mark.slow
 def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
     """With whole numbers among the coefficients, as one types them; and what else the log's notes have to say."""
     street = [

@@ -9,7 +9,7 @@ import torch
 from lightning.fabric.strategies.launchers.subprocess_script import _hydra_subprocess_cmd
 from omegaconf import DictConfig
 
-from sparsestreet.cli.train import train
+from sparsestreet.cli.commands.train import train
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_where_memory_does_not_do_it_is_one_line(tmp_path, capsys, monkeypatch):
     def out_of_memory(*told):
         raise torch.OutOfMemoryError("CUDA out of memory.\nTried to allocate 2.00 GiB")
 
-    monkeypatch.setattr("sparsestreet.cli.run.run", out_of_memory)
+    monkeypatch.setattr("sparsestreet.cli.runs.run.run", out_of_memory)
     with pytest.raises(SystemExit) as ended:
         train([f"out={tmp_path / 'run'}"])
     assert ended.value.code == 1
@@ -63,6 +63,7 @@ def test_where_memory_does_not_do_it_is_one_line(tmp_path, capsys, monkeypatch):
     ]
 
 
+@pytest.mark.slow
 def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypatch):
     """By Lightning's launcher, which is asked for the words alone; of a sweep each job has its own."""
     started = []
@@ -73,9 +74,9 @@ def test_another_process_is_started_with_the_words_of_the_job(tmp_path, monkeypa
             started.append(_hydra_subprocess_cmd(local_rank=1)[0])
         return 0.0
 
-    monkeypatch.setattr("sparsestreet.cli.run.run", ask)
+    monkeypatch.setattr("sparsestreet.cli.runs.run.run", ask)
     for check in ("override_problem", "_problem_of_values"):  # half of the test's time
-        monkeypatch.setattr(f"sparsestreet.cli.train.{check}", lambda words: None)
+        monkeypatch.setattr(f"sparsestreet.cli.commands.train.{check}", lambda words: None)
     monkeypatch.setattr(sys, "argv", ["/there/bin/sparsestreet", "train", "-m"])
     assert train(["method=3dgs", "seed=1", f"out={tmp_path / 'one'}"]) == 0
     assert train(["-m", "method=3dgs", "seed=2,3", f"hydra.sweep.dir={tmp_path}"]) == 0

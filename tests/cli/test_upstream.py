@@ -1,146 +1,57 @@
-"""``sparsestreet presets``: every setting of DriveStudio's beside ours, each row with its verdict and its reason."""
+"""``sparsestreet presets``: every setting of DriveStudio's beside ours, as the table has them."""
 
+import ast
+import itertools
 from typing import Any
 
 import pytest
-from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.compose import CONF, resolved
-from sparsestreet.cli.options import OptionError, parse_options
-from sparsestreet.cli.presets import WIDTH, PresetsRequest, lines, overview, presets
-from sparsestreet.cli.upstream import (
-    KEYS,
-    SETTINGS,
-    Row,
-    alternatives,
-    compare,
-    compare_settings,
-    pairs,
-    problems,
-    upstream_settings,
-)
+from sparsestreet.cli.commands.options import OptionError, parse_options
+from sparsestreet.cli.commands.presets import SAID, WIDTH, PresetsRequest, lines, overview, pairs, presets, rows_of
+from sparsestreet.cli.config.compose import CONF, resolved
 from sparsestreet.records.configuration import flat_config
 from tests.cli.configurations import composed
 
-FULL = ("schedule=paper", "capacity=paper")
-MAPPING: Any = OmegaConf.to_container(OmegaConf.load(KEYS))
+
+def alternatives(ours: str) -> list[str]:
+    """``node.a|b.rate`` as the keys that it stands for."""
+    return [".".join(parts) for parts in itertools.product(*(part.split("|") for part in ours.split(".")))]
 
 
-def test_there_is_a_column_for_each_configuration_of_the_presets():
-    folder = CONF / "preset" / "method"
-    there = [(path.parent.name, path.stem) for path in folder.glob("drivestudio*/*.yaml")]
-    assert sorted(pairs()) == sorted(there)
-    assert set(MAPPING["columns"].values()) == set(upstream_settings())
-
-
-@pytest.mark.parametrize(("preset", "method"), pairs())
-def test_every_row_is_equal_or_has_its_one_reason(preset: str, method: str):
-    assert problems(compare(preset, method).rows) == []
+def literal(cell: str) -> Any:
+    try:
+        return ast.literal_eval(cell)
+    except (ValueError, SyntaxError):
+        return cell
 
 
 @pytest.mark.parametrize(("preset", "method"), pairs())
-def test_every_key_of_upstream_has_one_row(preset: str, method: str):
-    """Counted in the file, by columns of text."""
-    found = compare(preset, method)
-    lines = [line.split("\t") for line in SETTINGS.read_text().splitlines() if not line.startswith("#")]
-    column = lines[0].index(found.column)
-    assert [row.key for row in found.rows] == [line[0] for line in lines[1:] if line[column] != "-"]
+def test_our_values_are_those_that_the_preset_composes(preset: str, method: str):
+    cfg = composed(f"preset={preset}", f"method={method}", "schedule=paper", "capacity=paper")
+    flat: dict[str, Any] = dict(flat_config(resolved(cfg)))
+    lists = {key: value for key, value in flat.items() if isinstance(value, list)}
+    flat |= {f"{key}.{index}": item for key, items in lists.items() for index, item in enumerate(items)}
+    rows = rows_of(preset, method)
+    ours = [row for row in rows if row.ours != "-"]
+    assert len(ours) > 60
+    for row in ours:
+        found = [flat[key] for key in alternatives(row.ours)]
+        assert found == [literal(row.value)] * len(found), row.key
+    notes = [row.reason.removesuffix(SAID).strip() for row in rows if row.verdict == "said" or SAID in row.reason]
+    said = set(cfg.preset.absent.values())
+    assert said == {note for note in said if any(note in one for one in notes)}
+    assert all(any(note in one for note in said) for one in notes)
 
 
 @pytest.mark.parametrize(("preset", "method"), pairs())
-def test_what_changes_results_is_said_by_a_training(preset: str, method: str):
-    """Its notes are the reasons of these rows, and those without a key."""
-    found = compare(preset, method)
-    notes = composed(f"preset={preset}", f"method={method}", *FULL).preset.absent.values()
-    assert {reason for row in found.rows if row.said for reason in row.reasons} | set(found.beyond) == set(notes)
-
-
-def test_what_the_mapping_names_is_there():
-    """Neither a key of ours nor one of upstream's is misspelled; no note and no sentence is left over."""
-    all_of = [flat_config(resolved(composed(f"preset={p}", f"method={m}", *FULL))) for p, m in pairs()]
-    ours = {key for flat in all_of for key in flat} | {f"data.log.lidar_ahead.{index}" for index in range(2)}
-    entries = [entry if isinstance(entry, str) else entry["ours"] for entry in MAPPING["keys"].values()]
-    assert {key for entry in entries for key in alternatives(entry)} - ours == set()
-    upstream = {key for settings in upstream_settings().values() for key in settings}
-    assert MAPPING["keys"].keys() - upstream == set()
-    rows = [row for preset, method in pairs() for row in compare(preset, method).rows]
-    assert {reason for row in rows for reason in row.reasons} >= MAPPING["because"].keys()
-    assert {f"preset.absent.{name}" for name in MAPPING["lacks"]} <= {key for flat in all_of for key in flat}
-
-
-def compared(upstream: Any, ours: Any, entry: Any, **reasons: Any) -> Row:
-    """The row of one key."""
-    cfg = OmegaConf.create({"a": ours, "schedule": {"max_steps": 200}, "preset": {"absent": {"note": "no such thing"}}})
-    assert isinstance(cfg, DictConfig)
-    mapping = {"keys": {"theirs": entry} if entry else {}, "lacks": {}, "because": {}, **reasons}
-    (row,) = compare_settings({"theirs": upstream}, cfg, mapping)
-    return row
-
-
-@pytest.mark.parametrize(
-    ("upstream", "ours", "entry", "verdict", "here"),
-    [
-        (0.3, 0.3, "a", "equal", 0.3),
-        (0.3, 0.1 + 0.2, "a", "equal", 0.1 + 0.2),
-        (0.3, 0.3001, "a", "differs", 0.3001),
-        (1, True, "a", "differs", True),  # a number is no switch
-        (4, 4.0, "a", "equal", 4.0),
-        (51, 0.25, {"ours": "a", "steps": 1}, "equal", 51),
-        (51, 0.25, {"ours": "a", "steps": 0}, "differs", 50),
-        (0.5, 1.0, {"ours": "a", "per": 2}, "equal", 0.5),
-        ("on", None, {"ours": "a", "read": {"None": "on"}}, "equal", "on"),
-        ("on", 3, {"ours": "a", "read": {"None": "on"}}, "differs", 3),
-        (7, {"b": 7, "c": 7}, "a.b|c|d", "equal", 7),
-        (7, {"b": 7, "c": 8}, "a.b|c|d", "differs", [7, 8]),
-        (7, {"b": 7}, "a.c|d", "absent", None),
-        (7, [6, 7], "a.1", "equal", 7),
-        (7, 7, None, "absent", None),
-    ],
-)
-def test_the_verdict_is_computed(upstream: Any, ours: Any, entry: Any, verdict: str, here: Any):
-    row = compared(upstream, ours, entry)
-    assert (row.verdict, row.here) == (verdict, here)
-
-
-def test_a_row_without_a_reason_and_an_equal_one_with_a_reason_are_problems():
-    because = {"nobody needs it": ["their*"]}
-    lacks = {"note": ["theirs"], "another preset's": ["theirs"]}
-    assert problems((compared(1, 1, "a"),)) == []
-    assert problems((compared(1, 2, "a", because=because), compared(1, 2, "a", lacks=lacks))) == []
-    assert problems((compared(1, 2, "a"),)) == ["theirs differs (upstream 1, here 2), with 0 reasons"]
-    assert problems((compared(1, 2, None),)) == ["theirs absent (upstream 1, here None), with 0 reasons"]
-    assert problems((compared(1, 1, "a", because=because),)) == ["theirs equal (upstream 1, here 1), with 1 reasons"]
-    assert len(problems((compared(1, 1, "a", lacks=lacks), compared(1, 2, "a", lacks=lacks, because=because)))) == 2
-
-
-def test_a_reason_that_changes_results_is_that_of_the_preset():
-    row = compared(1, 2, "a", lacks={"note": ["theirs"]})
-    assert (row.reasons, row.said) == (("no such thing",), True)
-    assert not compared(1, 2, "a", because={"nobody needs it": ["theirs"]}).said
-
-
-def test_a_changed_value_is_seen():
-    """Of every kind of entry: as it is, steps, a factor, a word; and one node of several."""
-    changed = {
-        "trainer.losses.ssim.w": "loss.photometric.lambda_dssim=0.3",
-        "trainer.gaussian_ctrl_general_cfg.stop_split_at": "schedule.densify_until=0.5",
-        "model.RigidNodes.optim.ins_rotation.lr": "node.rigid.learning_rates.rotation_deltas.initial=1.0e-5",
-        "model.Sky.type": "effects.sky.when=auto",
-        "trainer.gaussian_ctrl_general_cfg.cull_alpha_thresh": "node.rigid.density.cull_opacity=0.01",
-    }
-    cfg = composed("preset=drivestudio_legacy", "method=streetgs", *FULL, *changed.values())
-    rows = compare_settings(upstream_settings()["paper_legacy/streetgs"], cfg, MAPPING)
-    found = {row.key for row in rows if row.verdict == "differs" and not row.reasons}
-    assert found == {*changed, "trainer.losses.rgb.w"}
-
-
-@pytest.mark.parametrize(("preset", "method"), pairs())
-def test_the_table_fits_and_has_every_row(preset: str, method: str):
-    found = compare(preset, method)
-    text = list(lines(found))
+def test_every_key_has_one_row_and_every_difference_its_reason(preset: str, method: str):
+    rows = [row for row in rows_of(preset, method) if row.verdict != "said"]
+    assert len({row.key for row in rows}) == len(rows) > 100
+    assert all((row.verdict == "equal") == (row.reason == "") for row in rows)
+    assert all((row.verdict == "absent") == (row.ours == "-") for row in rows)
+    text = list(lines(rows_of(preset, method)))
     assert max(map(len, "\n".join(text).splitlines())) <= WIDTH
-    assert f"{found.count('equal')} equal, {found.count('differs')} differ, {found.count('absent')} absent" in text[1]
-    assert sum(line.startswith(("equal ", "differs ", "absent ")) for line in text) == len(found.rows)
+    assert sum(line.startswith(("equal ", "differs ", "absent ")) for line in text) == len(rows)
 
 
 def test_the_columns_stand_under_their_titles(capsys):

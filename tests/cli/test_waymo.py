@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestreet.cli.data import data
+from sparsestreet.cli.commands.data import data
 from tests.data.waymo import records
 from tests.data.waymo.drive import Drive
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparsestreet.cli.export import export
+from sparsestreet.cli.commands.export import export
 from sparsestreet.export.path import recorded
 from sparsestreet.export.recording import recorded_parts
 from sparsestreet.scene.storage import save_scene

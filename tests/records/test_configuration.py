@@ -30,7 +30,7 @@ def test_a_tree_becomes_flat():
         {"trainer.accelerator": "gpu"},
         {"trainer.val_check_interval": 5},
         {"evaluation.novel": [1, 2]},
-        {"reuse": False},
+        {"trunk": "a/run"},
     ],
 )
 def test_what_names_or_places_a_run_is_no_part_of_its_identity(names):

@@ -5,7 +5,6 @@ import sys
 
 import pytest
 
-from sparsestreet.records.same_as import SAME_AS, SameAs
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.report import collect
@@ -19,17 +18,6 @@ def test_collect_finds_each_run_once(tmp_path):
     assert [record.summary.run.label for record in found] == ["a/run", "b"]
     assert found[1].folder == (tmp_path / "b").resolve()
     assert collect([tmp_path / "b"])[0].summary.run.label == "b"  # the run's folder itself
-
-
-def test_a_run_that_a_second_sweep_took_is_no_repeat(tmp_path):
-    """In a report of both; that of the second sweep alone has it, also where the first is gone."""
-    for folder, label in (("one/run", "plain"), ("two/run", "plain"), ("two/renamed", "else")):
-        SUMMARY.write(tmp_path / folder, make_summary(label))
-    for name in ("run", "renamed"):
-        SAME_AS.write(tmp_path / "two" / name, SameAs(run="../../one/run", label="plain", command="train"))
-    names = [str(record.folder.relative_to(tmp_path)) for record in collect([tmp_path])]
-    assert names == ["one/run", "two/renamed"]
-    assert [record.folder.name for record in collect([tmp_path / "two"])] == ["renamed", "run"]
 
 
 def test_collect_names_what_is_wrong(tmp_path):
@@ -46,7 +34,7 @@ def test_collect_names_what_is_wrong(tmp_path):
 @pytest.mark.lengthy
 def test_a_report_imports_no_torch():
     """What import contracts cannot see: imports inside of functions, and the command."""
-    code = "import sys, sparsestreet.cli.report; sys.exit('torch' in sys.modules)"
+    code = "import sys, sparsestreet.cli.commands.report; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

@@ -72,7 +72,8 @@ def background_settings(
 def rigid_settings(**changes) -> RigidSettings:
     """The cars of ``street_log`` that move; no limits, no mask, no density control, unless said."""
     said = {"classes": ("Car",), "min_path_length": 1.0, "learning_rates": RATES | POSE_RATES, "prunable": False}
-    return RigidSettings(**(_UNLIMITED | said | changes))
+    plain = {"min_displacement": None, "min_instance_gaussians": 0.0, "points_per_instance": 5000}
+    return RigidSettings(**(_UNLIMITED | plain | said | changes))
 
 
 _UNLIMITED = {"min_gaussians": 0, "max_gaussians": None, "mask": None, "masked": False, "density": None}

@@ -59,7 +59,9 @@ def data() -> StreetData:
 
 def recipe(out: Path, *watch: Callback) -> Recipe:
     """Gaussians come and go at steps 4, 8 and 12."""
-    background = BackgroundSettings(num_points=60, density=GradientDensity(grad_threshold=1e-6))
+    background = BackgroundSettings(
+        num_points=60, min_gaussians=0, max_gaussians=None, density=GradientDensity(grad_threshold=1e-6)
+    )
     return Recipe(
         nodes={"background": background},
         callbacks={

@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from torch import Tensor, nn
 
-from sparsestreet.cli.compose import CONF
+from sparsestreet.cli.config.compose import CONF
 from sparsestreet.ops import splat
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from PIL import Image
 
-from sparsestreet.cli.view import USAGE, ViewRequest, view
+from sparsestreet.cli.commands.view import USAGE, ViewRequest, view
 from sparsestreet.viewing.edit_state import EditState
 from sparsestreet.viewing.server import Viewer
 from sparsestreet.viewing.stage import Stage

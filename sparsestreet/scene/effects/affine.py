@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from jaxtyping import Float
@@ -26,6 +26,7 @@ class AffineSettings(EffectSettings):
     learns. Raises ValueError for a negative weight.
     """
 
+    when: Literal["auto", "on", "off"] = "off"
     weight: float = 1e-5
     """Of mean |A - I| + mean |b|."""
     decay: float = 1e-6

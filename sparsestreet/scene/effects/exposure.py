@@ -41,7 +41,7 @@ class ExposureSettings(EffectSettings):
     level: float = 1.0
     """Weight of the squared mean log gain over all images, by channel: twice the gains with half the light are the same
     images."""
-    learning_rates: Rates = field(default_factory=lambda: {"log_gains": LearningRate(1e-3)})
+    learning_rates: Rates = field(default_factory=lambda: {"log_gains": LearningRate(1e-3, 1e-4)})
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -28,7 +28,7 @@ _NS_PER_PIXEL = 4.8
 class SkySettings(EffectSettings):
     """Size, start and learning rate of the sky's cube map. Raises ValueError for a cube map without a texel."""
 
-    resolution: int = 128
+    resolution: int = 64
     initial_color: float = 0.5
     min_share: float = 0.005
     """Of the pixels, from which the log calls for it: what a tunnel lacks."""

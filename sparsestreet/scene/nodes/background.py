@@ -28,14 +28,14 @@ _EXTREMES = (Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0))
 
 
 def usual_sources() -> dict[str, PointSource]:
-    """Returns the sources of conf/source: lidar, images, and guesses where neither sees anything.
+    """Returns the sources of conf/options/source.yaml: lidar, images, and guesses where neither sees anything.
 
     >>> list(usual_sources())
     ['lidar', 'images', 'near', 'far']
     """
     return {
         "lidar": LidarPoints(),
-        "images": ImagePoints(initial_opacity=0.5),
+        "images": ImagePoints(),
         "near": NearPoints(part=0.333),
         "far": FarPoints(part=0.667),
     }
@@ -48,6 +48,8 @@ class BackgroundSettings(NodeSettings):
     Raises ValueError for limits that contradict each other, and for sources that ask for more than all points.
     """
 
+    min_gaussians: int = 4000
+    max_gaussians: int | None = 130_000
     num_points: int = 40_000
     """Largest number of points of all sources together, but for those with a ``number``. The coverage of the training
     images sets each one's share."""

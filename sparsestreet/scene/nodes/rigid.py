@@ -16,6 +16,10 @@ from sparsestreet.types import View
 class RigidSettings(TrackedSettings):
     """``TrackedSettings`` with the distance by which a Gaussian may leave its box."""
 
+    min_displacement: float | None = 1.0
+    min_gaussians: int = 1000
+    max_gaussians: int | None = 8000
+    points_per_instance: int = 300
     box_margin: float = 0.1
     """Meters by which a row's center may lie outside its box; annotated boxes are about this tight."""
 

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -22,6 +22,7 @@ from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_box
 from sparsestreet.scene.initialize.gaussians import neighbor_scales
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.learning_rate import Rates, usual_track_rates
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
 from sparsestreet.scene.nodes.regularizers import REACH, temporal_smoothness, temporal_smoothness_at
@@ -34,6 +35,7 @@ class TrackedSettings(NodeSettings):
     """Settings of objects. They start from lidar returns of all training instants, pooled in the frame of each object's
     box, and from points from images there."""
 
+    min_instance_gaussians: float = 10.0
     points_per_instance: int = 5000
     box_points: int = 1000
     """An instance with fewer points than this gets additional random points on the faces of its box; 0: none does, and
@@ -41,6 +43,7 @@ class TrackedSettings(NodeSettings):
     initial_opacity: float = 0.1
     max_gap: int = 2
     """Frames' worth of time; within its span, an object is present up to this far from a training annotation."""
+    learning_rates: Rates = field(default_factory=usual_track_rates)
     temporal_smooth: float = 0.0
     """Weight of the term that keeps learned tracks smooth (see ``regularizers.temporal_smoothness``); 0: the term is
     not computed."""

@@ -11,7 +11,7 @@ import torch
 from omegaconf import OmegaConf
 from PIL import Image
 
-from sparsestreet.cli.compose import CONF
+from sparsestreet.cli.config.compose import CONF
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
 from sparsestreet.data.drivestudio.classes import KNOWN, class_in

@@ -8,7 +8,7 @@ import pytest
 from hydra import compose
 from hydra.utils import instantiate
 
-from sparsestreet.cli.compose import configuration
+from sparsestreet.cli.config.compose import configuration
 from sparsestreet.data.synthetic import LidarSensor, StreetReader, StreetSettings
 from sparsestreet.data.synthetic.lidar import StreetSweep, sweep
 from sparsestreet.data.synthetic.parts import Part, at

@@ -27,7 +27,7 @@ def directions_of(side: int) -> torch.Tensor:
 
 
 def test_the_start_is_gray():
-    assert Sky().texels.shape == (6, 128, 128, 3)
+    assert Sky().texels.shape == (6, 64, 64, 3)
     colors = Sky().colors(torch.randn(3, 4, 3, generator=torch.Generator().manual_seed(0)))
     torch.testing.assert_close(colors, torch.full((3, 4, 3), 0.5))  # four weights that sum to 1, rounded
 

@@ -27,6 +27,7 @@ class ImagePoints(PointSource):
     0.25
     """
 
+    initial_opacity: float = 0.5
     order: Literal["beyond_first", "beyond_only", "random"] = "beyond_first"
     """Points to take: those beyond the lidar before the others, those beyond it alone, or any."""
     voxel: float | None = None

@@ -1,0 +1,192 @@
+"""``sparsestreet export RUN FILE``: Gaussians of a trained street for viewers, or a page that plays it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sparsestreet.cli.commands.options import run_command
+from sparsestreet.naming import one_line
+
+if TYPE_CHECKING:
+    from sparsestreet.scene.storage import StoredScene
+    from sparsestreet.scene.views import RecordedViews
+
+USAGE = """\
+sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers read it
+
+  sparsestreet export outputs/RUN street.ply                     the whole street, at the start of its log
+  sparsestreet export outputs/RUN street.ply time=0.5            half way through the log
+  sparsestreet export outputs/RUN empty.ply nodes=background     without what moves
+  sparsestreet export outputs/RUN car.ply time=0.5 instance=12   one object, where it is at that time
+  sparsestreet export outputs/RUN street.html                    one page that plays the drive, in any browser, offline
+  sparsestreet export outputs/RUN empty.html edits=edits.yaml    without or with other objects
+  sparsestreet export outputs/RUN street.street                  all of it, small; every command opens it like a run
+  sparsestreet export outputs/RUN street.spz time=0.5            one frame for viewers, small
+  sparsestreet export outputs/RUN street.spz check=true          what the file keeps and loses, measured
+  sparsestreet export outputs/RUN objects/                       each object in a file, and poses.json, for engines
+  sparsestreet export outputs/RUN street.usdz                    what AlpaSim loads of it (docs/serving.md)
+
+  scene      a run's folder, a scene.safetensors, or a .street; the first word without a key
+  out        (the second) the ending says what: a .street, the whole scene; .ply in the layout of 3DGS or .spz,
+             one frame; an .html (docs/viewing.md); no ending, a folder of objects. docs/shipping.md says what each
+             keeps
+  edits      edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
+  views      the views.json that holds the cameras (default: the one beside the scene, or in it)
+  parts      [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
+
+of a .ply or .spz:
+  time       0 to 1: first to last frame of the log (default: 0)
+  nodes      [background,rigid]: only these nodes of the scene
+  instance   only this object, by the name of its track; a name that does not exist lists those that do
+  sky        true: the sky as 12,000 discs far away; not of a .ply (default: true)
+  check      true: read the file again, by splat-transform where it is installed, and say what it lost
+
+of an .html:
+  shapes     shapes a second of what changes its shape, such as people (default: 4); more are smoother and larger
+
+of a .usdz:
+  car        [length,width,height] in meters of the recording car (default: 4.8,1.9,1.6)
+  mount      as sparsestreet serve takes it
+  names      as sparsestreet serve takes them
+"""
+
+DEFAULT_SHAPES = 4.0
+
+_FRAME = ("time", "nodes", "instance")
+_OWN = {
+    ".street": (),
+    ".ply": _FRAME,
+    ".spz": (*_FRAME, "sky", "check"),
+    ".html": ("shapes",),
+    "": (),
+    ".usdz": ("car", "mount", "names"),
+}
+"""Ending of a file -> the options that not every file has."""
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """The command's options. Raises ValueError where they contradict each other."""
+
+    scene: Path
+    out: Path
+    time: float | None = None
+    nodes: tuple[str, ...] | None = None
+    instance: str | None = None
+    edits: Path | None = None
+    views: Path | None = None
+    shapes: float | None = None
+    car: tuple[float, ...] | None = None
+    mount: tuple[float, ...] | None = None
+    names: tuple[str, ...] | None = None
+    sky: bool | None = None
+    check: bool | None = None
+    parts: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """The file's ending, of which viewers take ``.compressed.ply`` for another format than ``.ply``."""
+        return ".compressed.ply" if self.out.name.endswith(".compressed.ply") else self.out.suffix
+
+    def __post_init__(self) -> None:
+        if self.nodes is not None and self.instance is not None:
+            raise ValueError("nodes and instance exclude each other: leave one out")
+        if self.kind not in _OWN:
+            raise ValueError(f"the file must end in {', '.join(filter(None, _OWN))}, got {self.out.name!r}")
+        others = {name for names in _OWN.values() for name in names} - set(_OWN[self.kind])
+        others |= {"edits"} if self.kind in (".usdz", ".street") else set()
+        for name in sorted(others):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name} is no option of a {self.kind or 'folder'}: leave it out")
+        if self.shapes is not None and self.shapes <= 0:
+            raise ValueError(f"shapes must be above 0 a second, got {self.shapes:g}")
+
+
+def export(arguments: list[str]) -> int:
+    """Write the file; 2 on wrong usage, 1 if something is missing."""
+    return run_command("export", USAGE, arguments, ExportRequest, _export, positional=("scene", "out"))
+
+
+def _export(request: ExportRequest) -> None:
+    # Imported here: torch takes a second, and --help needs none of it.
+    if request.out.suffix == ".usdz":
+        from sparsestreet.cli.commands.export_files import export_artifact
+
+        export_artifact(request.scene, request.out, request.car, request.mount, request.names, request.parts)
+        return
+    from sparsestreet.cli.commands.scenes import open_scene, recorded_views, with_edits
+
+    stored = open_scene(request.scene, "cpu", request.parts)
+    if request.kind == ".street":
+        return _export_street(request, stored)
+    if request.kind in (".html", "") or request.edits is not None:
+        views = recorded_views(request.scene, request.views)
+        stored = with_edits(stored, views, request.edits)
+        if request.out.suffix == ".html":
+            return _export_page(request, stored, views)
+        if request.kind == "":
+            return _export_objects(request, stored, views)
+    from sparsestreet.cli.commands.export_files import FrameExport, export_frame
+
+    wanted = FrameExport(
+        request.scene,
+        request.views,
+        request.out,
+        request.kind,
+        request.time or 0.0,
+        request.nodes,
+        request.instance,
+        sky=request.sky is not False,
+        check=bool(request.check),
+    )
+    export_frame(wanted, stored)
+
+
+def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
+    from sparsestreet.scene.beside import files_beside
+    from sparsestreet.scene.street_file import save_street
+
+    save_street(request.out, stored, files_beside(request.scene, request.views))
+    count, size = sum(stored.scene.counts().values()), request.out.stat().st_size
+    print(f"{request.out}: {count:,} Gaussians, {size / 1e6:.2f} MB, {size / max(count, 1):.1f} bytes a Gaussian")
+
+
+def _export_objects(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
+    from sparsestreet.cli.commands.export_files import ANTIALIAS_LOST, lost_of_scene
+    from sparsestreet.export.object_files import POSES, write_objects
+    from sparsestreet.export.ply import instance_names
+
+    names = write_objects(request.out, stored, views.all)
+    print(f"{request.out}: {len(names)} objects and {POSES}: {', '.join(map(one_line, names))}")
+    absent = sorted(set(instance_names(stored)) - set(names))
+    if absent:
+        print(f"left out, as no recorded frame shows them: {', '.join(map(one_line, absent))}")
+    if stored.options.settings.antialias:
+        print(ANTIALIAS_LOST)
+    print(f"lost: {'; '.join(['the sky', 'how shapes change', *lost_of_scene(stored)])}")
+
+
+def _export_page(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
+    from sparsestreet.cli.commands.export_files import ANTIALIAS_LOST, lost_of_scene
+    from sparsestreet.cli.commands.scenes import log_seconds
+    from sparsestreet.export.page import viser_module, write_page
+    from sparsestreet.export.path import recorded
+    from sparsestreet.export.recording import recorded_parts
+    from sparsestreet.export.sky_dome import dome_around
+
+    viser_module()  # before the work
+    path = recorded(views.all)
+    seconds = [(rig[0].time - path[0][0].time) * log_seconds(views) for rig in path]
+    rate = (len(path) - 1) / seconds[-1] if seconds[-1] > 0 else 1.0
+    every = max(round(rate / (request.shapes or DEFAULT_SHAPES)), 1)
+    parts = recorded_parts(stored, path, every)
+    dome = dome_around(stored.scene, parts)
+    write_page(request.out, parts, seconds, path[0][0], dome=dome, title=stored.name)
+    moving = [part for part in parts if "/" in part.name]
+    print(
+        f"{request.out}: {sum(map(len, parts)):,} Gaussians, {len(moving)} objects, {seconds[-1]:.1f} s, "
+        f"{request.out.stat().st_size / 1e6:.1f} MB; open it in a browser"
+    )
+    if stored.options.settings.antialias:
+        print(ANTIALIAS_LOST)
+    print(f"lost: {'; '.join(['colors that change with the direction', *lost_of_scene(stored)])}")

@@ -1,0 +1,107 @@
+"""``sparsestreet report DIR ...``: tables from the records of runs."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import yaml
+from rich.console import Console
+
+from sparsestreet.cli.commands.options import run_command
+from sparsestreet.metrics.protocols import PROTOCOLS, Protocol
+from sparsestreet.report import collect, figure, markdown, sections, tables
+from sparsestreet.report.arms import arms
+from sparsestreet.report.collect import keep_records
+from sparsestreet.report.figures_readme import time_figure
+from sparsestreet.report.sweep import sweep_records, write_report
+from sparsestreet.safe_yaml import read_yaml
+
+USAGE = """\
+sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]
+                            [markdown=FILE] [figure=FILE.png] [records=FILE.jsonl]
+sparsestreet report sweep=DIR [protocol=drivestudio|strict] [figure=FILE.png]
+
+Tables of all runs below the folders: one per scene, then the mean over scenes. Runs of one label and one configuration
+are repeats and share a column; a label's other configurations have columns named by the options that differ. With a
+baseline (label or name of a column), differences to it, paired by scene and seed. The figure shows PSNR against size.
+records=FILE writes a line of JSON for each run or job: what made it, and what was measured. scripts/check_numbers.py
+compares a page's numbers with such a file.
+
+Of a sweep (sparsestreet train +sweep=NAME) DIR/report is written: tables.md, tables.tex and tables.csv in the layout of
+the paper, with its published figures in columns of their own, paired differences with intervals, the best arm at one
+quality and at one size; figures; and index.html, all of it in one file for a browser. Its figure=FILE shows quality
+against the seconds of training and the milliseconds of a frame.
+
+The protocol chooses definitions: drivestudio as in published tables; strict counts 8 bits, leaves out the hood of the
+recording car, takes the Gaussian window of SSIM, and both networks of LPIPS. A record holds all of them.
+"""
+
+
+@dataclass(frozen=True)
+class ReportRequest:
+    """The command's options. Raises ValueError where they contradict each other."""
+
+    folders: tuple[Path, ...] = ()
+    sweep: Path | None = None
+    baseline: str | None = None
+    sections: Literal["scenes", "mean", "all"] = "all"
+    protocol: Literal["drivestudio", "strict"] = "drivestudio"
+    markdown: Path | None = None
+    figure: Path | None = None
+    records: Path | None = None
+
+    def __post_init__(self) -> None:
+        if bool(self.folders) == (self.sweep is not None):
+            raise ValueError("name folders of runs, or sweep=DIR: one of both")
+        if self.sweep is not None and (self.baseline or self.markdown or self.sections != "all"):
+            raise ValueError(
+                "the report of a sweep has all of its sections: sweep=DIR goes with protocol, figure and records"
+            )
+
+
+def report(arguments: list[str]) -> int:
+    """Print the tables; 2 on wrong usage, 1 if records are missing or malformed."""
+    return run_command("report", USAGE, arguments, ReportRequest, _report, positional="folders")
+
+
+def _report(request: ReportRequest) -> None:
+    protocol = PROTOCOLS[request.protocol]
+    if request.records is not None:
+        keep_records(collect(request.folders or [request.sweep or Path()]), request.records)
+        print(f"{request.records}: a line for each run")
+    if request.sweep is not None:
+        _report_sweep(request.sweep, protocol, request.figure)
+        return
+    records = collect(request.folders)
+    found = sections(records, request.baseline, protocol)
+    if request.figure is not None:
+        figure(records, request.figure)
+    wanted = request.sections
+    shown = [one for one in found if wanted in ("all", "mean" if one.over_scenes else "scenes")]
+    if not shown:
+        raise ValueError("no configuration was run on two scenes, so there is no mean")
+    console = Console()
+    for part in tables(shown, console.width):
+        console.print(part)
+    if request.markdown is not None:
+        request.markdown.write_text(markdown(shown))
+
+
+def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> None:
+    """Write the report of a sweep and say where."""
+    written = write_report(folder, sweep_name(folder), protocol)
+    if picture is not None:
+        time_figure(arms(sweep_records(folder)), protocol, picture)
+    for sentence in (*written.notes, *written.verdict):
+        print(sentence)
+    print(f"{written.folder}: tables.md, tables.tex, tables.csv, figures, index.html")
+
+
+def sweep_name(folder: Path) -> str | None:
+    """Which of conf/sweep a folder is of; None for any other sweep. ``NAME_paper`` and ``NAME_others`` add rows to
+    the folder of NAME."""
+    path = folder / "multirun.yaml"
+    name = read_yaml(path, yaml.safe_load) if path.is_file() else None
+    for key in ("hydra", "runtime", "choices", "sweep"):
+        name = name.get(key) if isinstance(name, dict) else None
+    return name and name.removesuffix("_paper").removesuffix("_others")

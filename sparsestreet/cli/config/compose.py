@@ -1,0 +1,217 @@
+"""Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
+
+import io
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any, cast
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+from omegaconf import MISSING, DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from sparsestreet.cli.config.option_files import CONF
+from sparsestreet.cli.config.resolvers import register_resolvers
+from sparsestreet.safe_yaml import read_yaml
+
+register_resolvers()
+
+
+MOVED = {"data.log.min_lens_shift": "effects.lens.min_shift"}
+"""Keys of earlier versions -> where their value belongs now."""
+PATHS = {
+    *("out", "resume", "count_of", "trunk", "data.root", "data.log.root", "data.log.parent", "image_points.cache"),
+    *("hydra.run.dir", "hydra.sweep.dir"),
+}
+"""Keys whose value is a path, in whatever letters."""
+Tree = dict[str, Any]
+"""Keys below a key: a word in their place (``render=fast``) is an error."""
+
+
+@dataclass
+class TrainSchema:
+    """Every root key of conf/train.yaml: any other is an error, with ``+`` as well."""
+
+    name: str = MISSING
+    seed: Any = MISSING
+    capacity: Tree = MISSING
+    split: Tree = MISSING
+    training_views: Tree = MISSING
+    budget: Tree = MISSING
+    resume: str | None = None
+    overwrite: bool = False
+    trunk: str | None = None
+    checkpoint_every: Any = MISSING
+    branch_points: list[float] = field(default_factory=list)
+    count_of: str | None = None
+    data: Tree = MISSING
+    schedule: Tree = MISSING
+    assignment: Tree = MISSING
+    moving: Tree = MISSING
+    method: Tree = MISSING
+    preset: Tree = MISSING
+    sparsify: Tree = MISSING
+    node: Tree = MISSING
+    effects: Tree | None = None
+    image_points: Any = None
+    moved_views: Any = None
+    loss: Tree = MISSING
+    callback: Tree = MISSING
+    optimizer: Tree = MISSING
+    render: Tree = MISSING
+    trainer: Tree = MISSING
+    logger: Any = None
+    evaluation: Tree = MISSING
+    out: str = MISSING
+    folder: str = MISSING
+
+
+ConfigStore.instance().store(name="train_schema", node=TrainSchema)
+
+
+@contextmanager
+def configuration() -> Iterator[None]:
+    """Hydra knows where conf/ lies."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        yield
+
+
+def composed(overrides: Iterable[str]) -> DictConfig:
+    """The configuration of train with these overrides, as long as no app runs: its ``folder`` is here.
+
+    Answers to the same overrides are one object: read it, never change it. Raises what Hydra raises.
+    """
+    return _composed(tuple(overrides))
+
+
+@cache
+def _composed(overrides: tuple[str, ...]) -> DictConfig:
+    with configuration():
+        return compose("train", [*overrides, "folder=."])
+
+
+def as_typed(arguments: Sequence[str]) -> list[str]:
+    """The arguments, with quotes of Hydra's around a value that its grammar reads as something else than was typed.
+
+    A shell takes its own quotes away, so a folder's name comes with its spaces, commas and letters alone. Lists of a
+    sweep stay lists, unless there is a file of the whole name.
+    """
+    several = bool({"-m", "--multirun"} & set(arguments))
+    return [_as_typed(text, several) for text in arguments]
+
+
+def _as_typed(text: str, several: bool) -> str:
+    key, equals, value = text.partition("=")
+    if text.startswith("-") or not equals or not value or value[0] + value[-1] in ("''", '""') or "${" in value:
+        return text
+    path = key in PATHS
+    try:
+        override = OverridesParser.create().parse_override(text)
+    except HydraException:
+        plain = not set(value) & set("[]{}()'\",")
+        return f"{key}={_in_quotes(value)}" if path or plain else text
+    if (
+        not path
+        or value == "null"
+        or (override.is_sweep_override() and (several or key != "out") and not Path(value).exists())
+    ):
+        return text
+    return text if override.value() == value else f"{key}={_in_quotes(value)}"
+
+
+def quoted(value: str) -> str:
+    """A text as Hydra's grammar takes it, whatever characters it has.
+
+    >>> quoted("a/b-1"), quoted("it's ö")
+    ('a/b-1', "'it\\\\'s ö'")
+    """
+    return value if re.fullmatch(r"[A-Za-z0-9_./-]+", value) else _in_quotes(value)
+
+
+def _in_quotes(value: str) -> str:
+    # A backslash before a quote, or at the end, stands for itself where it is doubled.
+    escaped = re.sub(r"(\\*)('|$)", lambda end: 2 * end[1] + ("\\'" if end[2] else ""), value)
+    return f"'{escaped}'"
+
+
+def value_of(text: str) -> str:
+    """The value of an override without Hydra's quotes; a list of a sweep as it was typed."""
+    override = OverridesParser.create().parse_override(text)
+    return text.partition("=")[2] if override.is_sweep_override() else str(override.value())
+
+
+def without_flags(overrides: Sequence[str]) -> list[str]:
+    """The overrides without flags of Hydra's, and without the words after them (``--cfg job``)."""
+    pairs = zip(["", *overrides], overrides, strict=False)
+    return [text for before, text in pairs if not _is_flag(before, text)]
+
+
+def _is_flag(before: str, text: str) -> bool:
+    return text.startswith("-") or (before.startswith("-") and "=" not in text)
+
+
+def check_moved(cfg: DictConfig) -> None:
+    """Raises ValueError for a key that an earlier version wrote, and that has another name now."""
+    for old, new in MOVED.items():
+        place, _, name = old.rpartition(".")
+        if name in (OmegaConf.select(cfg, place) or {}):
+            raise ValueError(
+                f"the configuration has {old}, which is {new} now: move its value there, in .hydra/config.yaml"
+            )
+
+
+def resolved(cfg: DictConfig) -> dict[str, Any]:
+    """The configuration as plain values, with what its interpolations stand for."""
+    return cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
+
+
+def load_run_config(run: Path) -> DictConfig:
+    """The configuration that a run wrote, with the log where the run had it.
+
+    Raises FileNotFoundError naming what a run folder holds, ValueError for a file that is damaged.
+    """
+    path = run / ".hydra" / "config.yaml"
+    if not path.is_file():
+        if run.is_file():
+            from sparsestreet.scene.storage import scene_path  # torch
+
+            scene_path(run)  # says what it is
+        raise FileNotFoundError(f"{run} is no run: it has no .hydra/config.yaml; give a folder that train wrote")
+    cfg = load_config(path)
+    # Written as an interpolation that only a running app can resolve; and runs may have been moved.
+    cfg.folder = str(run)
+    try:
+        _find_log(cfg, run / ".hydra" / "hydra.yaml")
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{path} is damaged ({str(error).splitlines()[0]})") from error
+    return cfg
+
+
+def load_config(path: Path) -> DictConfig:
+    """A configuration that Hydra wrote. Raises ValueError, naming the file, for what is none."""
+    try:
+        cfg = read_yaml(path, lambda text: OmegaConf.load(io.StringIO(text)))
+    except OmegaConfBaseException as error:
+        raise ValueError(f"{path} is damaged ({' '.join(str(error).split())[:200]})") from error
+    if not isinstance(cfg, DictConfig):
+        raise ValueError(f"{path} is damaged: it holds no configuration")
+    return cfg
+
+
+def _find_log(cfg: DictConfig, launch: Path) -> None:
+    """Relative folders of the log are meant from where the run was started, as long as that is there."""
+    cwd = OmegaConf.select(load_config(launch), "hydra.runtime.cwd") if launch.is_file() else ""
+    if not isinstance(cwd, str):
+        raise ValueError(f"{launch} is damaged: it does not say where the run was started (hydra.runtime.cwd)")
+    started = Path(cwd)
+    if started.is_dir():
+        for key in ("data.root", "data.log.root", "data.log.parent"):
+            folder = OmegaConf.select(cfg, key)
+            if folder is not None:
+                OmegaConf.update(cfg, key, str(started / folder))
