@@ -181,9 +181,9 @@ run_training() {
 }
 
 run_bench() {
-  local options=(bench gpu --out "$OUT")
-  [ "$DRY" = 0 ] || options+=(--quick)
-  run_part bench 200 "$OUT/bench.log" "$PYTHON" -m sparsestreet "${options[@]}"
+  local options=("out=$OUT")
+  [ "$DRY" = 0 ] || options+=(quick=true)
+  run_part bench 200 "$OUT/bench.log" "$PYTHON" -m benchmarks.gpu "${options[@]}"
 }
 
 print_table() {

@@ -67,6 +67,10 @@ class TimingBudget:
             run()
 
 
+ONCE = TimingBudget(repeats=2, least=1)
+"""Enough to see that something runs."""
+
+
 @dataclass(frozen=True)
 class Cotangent:
     """A fixed random upstream gradient of color and alpha; alpha's part reveals errors of the transmittance."""

@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.bench.accuracy import Errors, answer, collect, errors
-from sparsestreet.bench.tile_loads import TileLoads, loads
 from sparsestreet.bench.timing import Cotangent, drop_gradients
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.types import Camera, Gaussians
@@ -22,12 +21,6 @@ SETTINGS = SplatSettings.preset("gsplat15")
 """Settings of our op in the comparison: gsplat's clamp, stop rule and near plane."""
 MODES = ("packed", "unpacked")
 """The first keeps only rows in view, which takes less memory. Which one is faster depends on the view."""
-LEAST_PSNR = 60.0
-"""Least PSNR of agreement, dB. Fast-math exponentials move a sample over the cut-off 1/255 in some pixels.
-
-If every thousandth pixel changed by 1/255, PSNR would be 78 dB."""
-LARGEST_GRADIENT_ERROR = 5e-3
-"""Largest relative L2 of a group. gsplat recovers transmittance by dividing: errors to 2e-3 in saturated pixels."""
 
 
 def find_gsplat(device: torch.device) -> ModuleType | str:
@@ -51,18 +44,6 @@ def draw(
     """Color (premultiplied), alpha and the number of (splat, tile) pairs; ``packed`` trades time for memory."""
     colors, alphas, meta = _rasterization(module, gaussians, camera, packed)
     return colors[0], alphas[0, ..., 0], int(meta["flatten_ids"].shape[0])
-
-
-@torch.no_grad()
-def loads_of(module: ModuleType, gaussians: Gaussians, camera: Camera) -> tuple[int, TileLoads | None]:
-    """The number of (splat, tile) pairs that it lists, and how they lie on its tiles; None if it does not say."""
-    _, _, meta = _rasterization(module, gaussians, camera, packed=False)
-    pairs, offsets = int(meta["flatten_ids"].shape[0]), meta.get("isect_offsets")
-    if offsets is None:
-        return pairs, None
-    begins = offsets.flatten()
-    lengths = torch.diff(begins, append=begins.new_tensor([pairs]))
-    return pairs, loads(lengths, lengths[:0], split=0)
 
 
 def draw_for_training(
@@ -115,11 +96,3 @@ def parity(module: ModuleType, rows: Gaussians, camera: Camera, backend: str) ->
     theirs = collect(rgb, rows)
     drop_gradients(rows)
     return errors(theirs, answer(rows, camera, SETTINGS, backend, rows.means.dtype, rows.means.device.type))
-
-
-def agrees(error: Errors) -> bool:
-    """Whether images and gradients agree within the limits above."""
-    if error.image.psnr is not None and error.image.psnr < LEAST_PSNR:
-        return False
-    groups = [group.relative_l2 for group in error.gradients.values()]
-    return all(value is not None and value <= LARGEST_GRADIENT_ERROR for value in groups)

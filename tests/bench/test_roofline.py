@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.bench.floors import Floor, StepWork, floors, measured_bandwidth
+from sparsestreet.bench.roofline import Floor, StepWork, floors, measured_bandwidth
 
 WORK = StepWork(rows=10, visible=4, terms=4, samples=100, parameters=50, size=(2, 3), sky_pixels=5)
 

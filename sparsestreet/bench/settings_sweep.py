@@ -1,28 +1,131 @@
-"""``sparsestreet bench knobs``: time, work and error of every knob on every scene, one record per point."""
+"""Time, work and error of every setting of the splat op on every scene: ``sparsestreet bench settings``."""
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 import torch
 
 from sparsestreet.bench.accuracy import Answer, Errors, answer, errors, image_error
-from sparsestreet.bench.culling import Culling, compare_culling, compare_touched
-from sparsestreet.bench.effects import EffectsName, seen_through
-from sparsestreet.bench.knobs import DEFAULT, FIXED, Point, backend_points
 from sparsestreet.bench.records import RecordFile, settings_entries
-from sparsestreet.bench.scenes import BenchScene, Size
-from sparsestreet.bench.tile_sizes import build, with_tiles
+from sparsestreet.bench.scenes import EFFECTS, BenchScene, EffectsName, Size, seen_through
 from sparsestreet.bench.timing import OpTimes, TimingBudget, leaves, time_op
 from sparsestreet.ops.backend import BACKENDS, resolve_backend
 from sparsestreet.ops.cpu.library import tile_size
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.records.strict_json import Json
 
+DEFAULT = SplatSettings()
+PRESETS = ("default", "exact", "gsplat15", "gsplat16", "inria", "fast", "fine")
+KNOBS: dict[str, tuple[float | int | bool | str, ...]] = {
+    "alpha_min": (0.0, 1 / 1024, 1 / 512, 1 / 255, 1 / 128, 1 / 64),
+    "max_sigma": (3.0, 3.33, 4.0, inf),
+    "transmittance_min": (1e-5, 1e-4, 1e-3, 1e-2),
+    "stop": ("inclusive", "exclusive"),
+    "eps2d": (0.0, 0.1, 0.3),
+    "half_colors": (False, True),
+    "depth_bits": (12, 16, 24, 32),
+}
+"""Fields of SplatSettings and their values."""
+BOXES_ALONE = (3.0, 3.33, 4.0)
+"""Values of max_sigma without alpha_min. Either bounds a splat, so each would hide what the other costs."""
+STOPS_EARLIER = (1e-3, 1e-2)
+"""Values of transmittance_min for the exclusive stop; KNOBS has them for the inclusive stop.
+
+The exclusive stop may lose transmittance_min / (1 - alpha_max) of a pixel's light, the inclusive one transmittance_min.
+"""
+OTHER_BACKENDS = (("cpu", torch.float64), ("reference", torch.float32), ("triton", torch.float32))
+"""The backends besides C++ in float32, which times all other points."""
+FIXED = {
+    ("dot precision", "cpu"): "no backend has a matrix product in its blend",
+    ("dot precision", "reference"): "a truth: matrix products in the dtype of the Gaussians",
+    ("dot precision", "triton"): "no backend has a matrix product in its blend",
+}
+"""Choices that a backend fixes: (knob, backend) -> what holds instead."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One configuration to time."""
+
+    knob: str
+    """The knob that is not at its default; ``default``, ``preset`` and ``backend`` for the rest."""
+    value: str
+    settings: SplatSettings
+    preset: str | None = None
+    """Name of the preset that has these settings."""
+    backend: str = "cpu"
+    dtype: torch.dtype = torch.float32
+    effects: EffectsName | None = None
+    """Lens and shutter that replace those of the scene's camera; None: its own."""
+
+    @property
+    def other_model(self) -> bool:
+        """Whether the image differs on purpose: blur, clamp, compensation, lens and shutter change the model."""
+        return _model(self.settings) != _model(DEFAULT) or self.effects not in (None, "off")
+
+    @property
+    def exact(self) -> SplatSettings:
+        """Settings of this point's own model without cut-offs: R0."""
+        blur, alpha_max, antialias = _model(self.settings)
+        exact = SplatSettings.preset("exact")
+        return replace(exact, eps2d=blur, alpha_max=alpha_max, antialias=antialias, near_plane=self.settings.near_plane)
+
+    @property
+    def same_cutoffs(self) -> SplatSettings:
+        """Settings with this point's cut-offs, without its rounding of colors and depths: R1."""
+        return replace(self.settings, half_colors=False, depth_bits=32)
+
+
+def points() -> list[Point]:
+    """All points: the default, every knob, presets that no knob reaches, effects and the other backends."""
+    effects = [Point("effects", name, DEFAULT, effects=name) for name in EFFECTS]
+    return [*_points_of_settings(), *effects, *backend_points()]
+
+
+def backend_points() -> list[Point]:
+    """The default's settings on the other backends and in other precision."""
+    return [
+        Point("backend", f"{name} {str(dtype).removeprefix('torch.')}", DEFAULT, backend=name, dtype=dtype)
+        for name, dtype in OTHER_BACKENDS
+    ]
+
+
+def _points_of_settings() -> list[Point]:
+    named = {name: SplatSettings.preset(name) for name in PRESETS}
+    swept = [Point("default", "default", DEFAULT)]
+    for knob, values in KNOBS.items():
+        changed = [(value, replace(DEFAULT, **{knob: value})) for value in values]
+        swept += [Point(knob, _text(knob, value), settings) for value, settings in changed if settings != DEFAULT]
+    swept += [
+        Point("box alone", _text("max_sigma", box), replace(DEFAULT, alpha_min=0.0, max_sigma=box))
+        for box in BOXES_ALONE
+    ]
+    swept += [
+        Point("exclusive stop", f"at {least:g}", replace(DEFAULT, stop="exclusive", transmittance_min=least))
+        for least in STOPS_EARLIER
+    ]
+    met = [point.settings for point in swept]
+    swept += [Point("preset", name, settings) for name, settings in named.items() if settings not in met]
+    names = {settings: name for name, settings in reversed(named.items())}
+    return [replace(point, preset=names.get(point.settings)) for point in swept]
+
+
+def _model(settings: SplatSettings) -> tuple[float, float, bool]:
+    return settings.eps2d, settings.alpha_max, settings.antialias
+
+
+def _text(knob: str, value: float | int | bool | str) -> str:
+    if not isinstance(value, float):
+        return str(value)
+    return f"1/{round(1 / value)}" if knob == "alpha_min" and value else f"{value:g}"
+
+
 FULL, QUICK, SMALL = Size(336, 224, 8_000), Size(48, 32, 200), Size(64, 48, 400)
 """Sizes of a sweep, of a trial, and of small copies for the dense reference.
 
-On the copies it is timed, and it is the oracle of truths and culling."""
+On the copies it is timed, and it is the oracle of the truths."""
 BUDGET = TimingBudget(repeats=20, seconds=2.0, least=3)
 QUICK_BUDGET = TimingBudget(repeats=2, seconds=0.1, least=1)
 DENSE_SAMPLES = 1 << 28
@@ -62,19 +165,6 @@ class KnobRecord:
     """Errors against this model in float64 without cut-offs (R0); None if that covers too many tiles to be held."""
     same_cutoffs: Errors | None = None
     """Errors against this model in float64 with the same cut-offs (R1), which are due to rounding alone."""
-    tiles_in_use: Errors | None = None
-    """Errors of a tile size against the library in use: only rounding, not a trade."""
-
-
-@dataclass(frozen=True)
-class CullingRecord:
-    """Evidence that culling by tiles is exact on this scene: identical images, not a trade."""
-
-    scene: str
-    rows: int
-    width: int
-    height: int
-    culling: Culling
 
 
 @dataclass(frozen=True)
@@ -136,8 +226,6 @@ def run_sweep(
     resolve_backend(_EXACT_BACKEND, torch.device("cpu"))
     for (knob, backend), holds in FIXED.items():
         file.write("fixed", FixedRecord(knob, backend, holds))
-    for size in (point.tile for point in points if point.tile is not None):
-        say(f"tiles of {size} pixels: {build(size).missing or 'compiled'}")
     for scene in small:
         file.write("oracle", check_oracle(scene))
         say(f"\nsmall copy of {title(scene)}")
@@ -145,17 +233,6 @@ def run_sweep(
     for scene in scenes:
         say(f"\n{title(scene)}")
         _measure_points(scene, points, budget, "knob", file, say)
-    for scene in small:
-        culling = compare_culling(scene.gaussians, scene.camera, DEFAULT)
-        _write_culling(scene, compare_touched(culling, scene.gaussians, scene.camera, DEFAULT), file, say)
-    for scene in scenes:
-        _write_culling(scene, compare_culling(scene.gaussians, scene.camera, DEFAULT), file, say)
-
-
-def _write_culling(scene: BenchScene, culling: Culling, file: RecordFile, say: Callable[[str], None]) -> None:
-    camera = scene.camera
-    file.write("culling", CullingRecord(scene.name, len(scene.gaussians), camera.width, camera.height, culling))
-    say(f"culling, {scene.name}, {camera.width}x{camera.height}: {culling}")
 
 
 def title(scene: BenchScene) -> str:
@@ -183,12 +260,7 @@ def measure_point(scene: BenchScene, point: Point, truths: Truths, budget: Timin
     record = _unmeasured(scene, point)
     if record.skipped is not None:
         return record
-    if point.tile is None:
-        times, value = time_and_answer(seen_through(scene, point.effects), point, budget)
-    else:
-        times, value = with_tiles(point.tile, time_and_answer, scene, point, budget)
-        in_use = answer(scene.gaussians, scene.camera, point.settings, point.backend, point.dtype)
-        record = replace(record, tiles_in_use=errors(value, in_use))
+    times, value = time_and_answer(seen_through(scene, point.effects), point, budget)
     record = replace(record, times=times, same_cutoffs=errors(value, truths.of(point.same_cutoffs, point.effects)))
     if not affordable(scene, point.exact):
         return record
@@ -244,8 +316,6 @@ def unavailable(scene: BenchScene, point: Point) -> str | None:
         return f"dense: {samples:.2g} samples, more than the {DENSE_SAMPLES:.2g} that are timed; see the small copies"
     if not affordable(scene, point.settings):
         return f"nothing bounds a splat: more than {UNBOUNDED_PAIRS:.2g} (splat, tile) pairs"
-    if point.tile is not None:
-        return build(point.tile).missing
     if point.backend == "triton":
         if "triton" not in BACKENDS:
             return "this version has no triton backend"
@@ -279,8 +349,6 @@ def describe(record: KnobRecord) -> str:
     psnr = record.exact.image.psnr
     image = "equal" if psnr is None else f"{psnr:6.1f} dB"
     note = f"  other model ({record.model_psnr:.1f} dB)" if record.model_psnr is not None else ""
-    if record.tiles_in_use is not None:
-        note = f"  {record.tiles_in_use.image.maximum:.0e} from the tiles in use"
     return f"{times}   {image}   gradient {worst_gradient(record.exact):.1e}{note}"
 
 

@@ -1,9 +1,15 @@
-"""``sparsestreet bench effects``: effects are planted in synthetic streets, and plans are asked what they see."""
+"""Plant effects in synthetic streets, and ask plans what they see: ``python -m benchmarks.effect_recall``."""
 
+import shlex
+import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from sparsestreet.bench.records import RecordFile
+from sparsestreet.cli.bench import record_file
+from sparsestreet.cli.effects import planned
+from sparsestreet.cli.options import run_command
 from sparsestreet.records.effects import EffectDecision
 
 LEVELS = (0.5, 2.0)
@@ -111,3 +117,33 @@ def table(asked: Sequence[Asked]) -> list[str]:
         cells = (f"**{n}**" if name in rows[0].expected else str(n) for n, name in zip(counts, effects, strict=True))
         lines.append(f"| {key[0]} | {key[1]:g} | {len(rows)} | {' | '.join(cells)} |")
     return lines
+
+
+USAGE = """\
+python -m benchmarks.effect_recall [key=value ...]     effects planted in synthetic streets: what plans see of them
+
+  seeds   streets of so many seeds (default: 10)
+  out     folder for effects.jsonl (default: outputs/bench)
+"""
+
+
+@dataclass(frozen=True)
+class RecallRequest:
+    """The script's options."""
+
+    seeds: int = 10
+    out: Path = Path("outputs/bench")
+
+
+def main(words: list[str]) -> int:
+    """Plant and ask as the words say; 2 on wrong usage."""
+    command = shlex.join(["python", "-m", "benchmarks.effect_recall", *words])
+
+    def act(request: RecallRequest) -> None:
+        run_planted(planned, range(request.seeds), record_file(request.out, "effects", command))
+
+    return run_command("effect_recall", USAGE, words or ["seeds=10"], RecallRequest, act)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
