@@ -9,8 +9,7 @@
    (``rows_backward``, and the backward halves beside each formula).
 
 ``screen`` runs the first two stages, ``pixels`` the third and the first half of the fourth. ``rasterizer`` makes an
-autograd function of them. ``tuning`` holds what only a device can decide. ``quaternions`` and ``vectors`` serve all
-formulas.
+autograd function of them. ``quaternions`` and ``vectors`` serve all formulas.
 
 Other parts of a training step have a file each: ``poses`` and ``activate`` before the op, ``sky`` and ``ssim`` after
 it, and ``adam``.

@@ -18,11 +18,9 @@ from sparsestreet.ops.triton.quadrants import (
     centers,
     held_splat,
     hold_splats,
-    load_splat,
     of_lines,
     part_places,
     quadrant_places,
-    row_of,
     touches,
 )
 from sparsestreet.ops.triton.thin import LOOK, alpha_of, open_light, thin_pairs
@@ -32,9 +30,9 @@ PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
 
 
-def registers(exclusive: bool, staged: bool, gated: bool) -> int:
-    """Fewest registers of a lane without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
-    return 96 + 8 * gated if staged else 88 if exclusive else 80
+def registers(gated: bool) -> int:
+    """Return the fewest registers of a lane without spills. A multiprocessor runs 20 warps with up to 96."""
+    return 96 + 8 * gated
 
 
 @jit
@@ -167,21 +165,20 @@ def blend_tiles(
     rgb, transmittance, depth_sum, lasts, part_rgb, part_transmittance, part_depth, part_lasts,
     width, height, tiles_x, part_count, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
-    PARTS: tl.constexpr, TOGETHER: tl.constexpr, REST: tl.constexpr, STAGED: tl.constexpr, GATED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    TOGETHER: tl.constexpr, REST: tl.constexpr, GATED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes every pixel of one tile; with PARTS those of one part, if needed, into the layers of parts (parts.py).
+    """Writes every pixel of one tile, and those of a part, if needed, into the layers of parts (parts.py).
 
     ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins. TOGETHER:
     whole tiles and parts. Of parts the first ones of tiles are then blended, and of the others it is computed what they
-    let through. REST: parts but the first ones. STAGED: each lane fetches the record of one of the next pairs. GATED:
-    a row's gate multiplies its alpha.
+    let through. REST: parts but the first ones. GATED: a row's gate multiplies its alpha. Each lane fetches the record
+    of one of the next pairs, because a warp then waits for memory once in LOOK pairs.
     """
     tl.static_assert(BLOCK == 1)
     tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
-    tile, part, k, end, is_part = work_of(*tables, PARTS, TOGETHER)
+    tile, part, k, end, is_part = work_of(*tables, REST, TOGETHER)
     limit, first = transmittance_min, part
-    if PARTS or TOGETHER:
+    if REST or TOGETHER:
         first = tl.load(firsts + part)
     if TOGETHER:
         later = is_part & (first < part)
@@ -203,11 +200,10 @@ def blend_tiles(
     pair = tl.load(pair_rows + k, written, 0)
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
-        if STAGED:
-            held = hold_splats(records, pair_rows, k, end, GATED)
+        held = hold_splats(records, pair_rows, k, end, GATED)
         for i in range(k, stop):
             touched = pair
-            splat = held_splat(held, i - k, GATED) if STAGED else load_splat(records, row_of(pair), GATED)
+            splat = held_splat(held, i - k, GATED)
             pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(y, splat[0], splat[1][0], 0)
@@ -220,10 +216,10 @@ def blend_tiles(
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     quadrants = (q0, q1, q2, q3)
     place, part, is_part = place_of(ahead, part_count, TOGETHER)
-    if PARTS or TOGETHER:
+    if REST or TOGETHER:
         layers = (part_rgb, part_transmittance, part_depth, part_lasts)
         store_in_part(written & is_part, quadrants, layers, part, products, DEPTH, LASTS, TOGETHER)
-    if not PARTS:
+    if not REST:
         layers, is_whole = (rgb, transmittance, depth_sum, lasts), place >= 0
         if TOGETHER:
             is_whole = not is_part

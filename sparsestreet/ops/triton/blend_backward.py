@@ -132,7 +132,7 @@ def light_behind(part_rgb, part_depth, part, following, v, at, DEPTH: tl.constex
 def last_quadrant(
     tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin,
     part, following, is_part, part_rgb, part_depth, part_transmittance, part_lasts, width, height, tiles_x,
-    QUADRANT: tl.constexpr, DEPTH: tl.constexpr, PARTS: tl.constexpr, TOGETHER: tl.constexpr,
+    QUADRANT: tl.constexpr, DEPTH: tl.constexpr, TOGETHER: tl.constexpr,
 ):  # fmt: skip
     """A quadrant after its last splat: the light left, and the light behind times the cotangents.
 
@@ -144,13 +144,10 @@ def last_quadrant(
     v = (red, green, blue, tl.load(v_depth_sum + at, inside, 0.0) if DEPTH else red)
     passed = tl.load(transmittance + at, inside, 0.0)
     behind = passed * tl.load(v_transmittance + at, inside, 0.0)
-    if PARTS or TOGETHER:
+    if TOGETHER:
         to = part_places(part, QUADRANT)
         behind += light_behind(part_rgb, part_depth, part, following, v, to, DEPTH)
-    if PARTS:
-        passed, last = tl.load(part_transmittance + to), tl.load(part_lasts + to)
-    else:
-        last = tl.load(lasts + at, inside, begin)
+    last = tl.load(lasts + at, inside, begin)
     if TOGETHER:
         passed, last = tl.load(part_transmittance + to, is_part, passed), tl.load(part_lasts + to, is_part, last)
     return (passed, behind), v, last
@@ -203,37 +200,34 @@ def differentiate_quadrant(
 def blend_tiles_backward(
     records, pair_rows, pair_slots, begins, ends, order, ahead, part_tiles, part_begins, part_ends, nexts,
     transmittance, lasts, part_rgb, part_depth, part_transmittance, part_lasts,
-    v_rgb, v_transmittance, v_depth_sum, slots, walked, width, height, tiles_x, part_count, alpha_max,
-    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, PARTS: tl.constexpr, TOGETHER: tl.constexpr, MARKED: tl.constexpr,
-    GATED: tl.constexpr, BLOCK: tl.constexpr,
+    v_rgb, v_transmittance, v_depth_sum, slots, width, height, tiles_x, part_count, alpha_max,
+    DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, TOGETHER: tl.constexpr, GATED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slots of all pairs of one tile, or (PARTS; TOGETHER: both) of one part of a tile.
+    """Writes the slots of all pairs of one tile, or (TOGETHER) of one part of a tile.
 
-    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given; MARKED: sets ``walked`` of each slot that it
-    writes, and leaves the slots behind the last pair that a pixel was open to. GATED: rows have gates, slots also the
-    sums for these.
+    ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given; GATED: rows have gates, slots
+    also the sums for these.
     """
     tl.static_assert(BLOCK == 1)
     length: tl.constexpr = GATED_SLOT if GATED else SLOT
     tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
-    tile, part, begin, end, is_part = work_of(*tables, PARTS, TOGETHER)
+    tile, part, begin, end, is_part = work_of(*tables, False, TOGETHER)
     following = part
-    if PARTS or TOGETHER:
+    if TOGETHER:
         following = tl.load(nexts + part, is_part, 0)
     given = (tile, transmittance, lasts, v_rgb, v_transmittance, v_depth_sum, begin)
     of_part = (part, following, is_part, part_rgb, part_depth, part_transmittance, part_lasts)
     size = (width, height, tiles_x)
-    q0, v0, last0 = last_quadrant(*given, *of_part, *size, 0, DEPTH, PARTS, TOGETHER)
-    q1, v1, last1 = last_quadrant(*given, *of_part, *size, 1, DEPTH, PARTS, TOGETHER)
-    q2, v2, last2 = last_quadrant(*given, *of_part, *size, 2, DEPTH, PARTS, TOGETHER)
-    q3, v3, last3 = last_quadrant(*given, *of_part, *size, 3, DEPTH, PARTS, TOGETHER)
+    q0, v0, last0 = last_quadrant(*given, *of_part, *size, 0, DEPTH, TOGETHER)
+    q1, v1, last1 = last_quadrant(*given, *of_part, *size, 1, DEPTH, TOGETHER)
+    q2, v2, last2 = last_quadrant(*given, *of_part, *size, 2, DEPTH, TOGETHER)
+    q3, v3, last3 = last_quadrant(*given, *of_part, *size, 3, DEPTH, TOGETHER)
     x, y = centers(tile, tiles_x)
     latest = tl.max(tl.maximum(tl.maximum(last0, last1), tl.maximum(last2, last3)))
     # A split tile leaves no pair to this program: its ``lasts`` are those of all parts together. A part that is not
     # needed has written nothing.
     latest = tl.maximum(tl.minimum(latest, end), begin)
-    if not MARKED:
-        zero_slots(slots, pair_slots, latest, end, length)
+    zero_slots(slots, pair_slots, latest, end, length)
     pair = tl.load(pair_rows + latest - 1, latest > begin, 0)
     k = latest - 1
     while k >= begin:
@@ -249,8 +243,5 @@ def blend_tiles_backward(
         line = of_lines(y, splat[0], splat[1][0], 1)
         q2, s = differentiate_quadrant(touches(touched, 2), q2, v2, last2, s, x, line, 0, *more, GATED)
         q3, s = differentiate_quadrant(touches(touched, 3), q3, v3, last3, s, x, line, 1, *more, GATED)
-        slot = tl.load(pair_slots + k)
-        store_sums(slots + slot * length, s, GATED)
-        if MARKED:
-            tl.store(walked + slot, 1)
+        store_sums(slots + tl.load(pair_slots + k) * length, s, GATED)
         k -= 1

@@ -16,10 +16,9 @@ from sparsestreet.ops.triton.arena import vectors
 from sparsestreet.ops.triton.blend import PIXEL_COUNT
 from sparsestreet.ops.triton.language import constant, jit
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.parts import Parts, most_parts_of, part_begin, parts_of, shortest_split
+from sparsestreet.ops.triton.parts import Parts, most_parts_of, part_begin, parts_of, shortest_split, split_rule
 from sparsestreet.ops.triton.search import first_at_least
 from sparsestreet.ops.triton.sizes import LISTED_PAIRS, Sizes
-from sparsestreet.ops.triton.tuning import tuning
 
 _BLOCK = 256
 _CLASS_COUNT = 32
@@ -43,8 +42,8 @@ def list_by_tile(
     ``keys``: the sorted tiles of the pairs, ``slots``: which each was before the sort.
 
     It does not wait for the device: there is room for the most parts that this room of pairs could need."""
-    room, blocks, choices = keys.shape[0], -(-tiles // _BLOCK), tuning()
-    part_count, rule = most_parts_of(room), (choices.shortest_part, choices.most_parts, choices.fewest_parts)
+    room, blocks = keys.shape[0], -(-tiles // _BLOCK)
+    part_count, rule = most_parts_of(room), split_rule()
     scratch = _AHEAD + 2 * tiles + 2 * _CLASS_COUNT * blocks
     pair_rows, begins, ends, whole_ends, order, of_tiles, ahead, lasts, *part_vectors = vectors(
         keys, room, *(tiles,) * 5, scratch, part_count * PIXEL_COUNT, *(part_count,) * 5

@@ -18,8 +18,16 @@ from torch import Tensor
 from sparsestreet.ops.triton.arena import vectors
 from sparsestreet.ops.triton.blend import PIXEL_COUNT, PIXELS
 from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.thin import thin_pairs
-from sparsestreet.ops.triton.tuning import tuning
+
+MAX_PARTS = 6144
+"""Most parts of a view, 7 kB each. A part has at least one of so many shares of all pairs; 1: no tile is split.
+
+A street lasts as long as its longest tile: without a split the pixel kernels of one took 3 to 5 times as long. The
+split moves images by rounding, as the light before a part is a product of other parts' products."""
+MIN_PART_PAIRS = 128
+"""Least number of pairs of a part. It bounds what parts cost in small views."""
+MIN_PARTS = 3
+"""Parts of the shortest tile that is split. What a split costs is too much for two parts."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +77,7 @@ class PartLayers:
 
 def part_length(pairs: int) -> int:
     """Least number of pairs of a part, for a view with ``pairs``; parts of a tile differ by at most one."""
-    return max(tuning().shortest_part, -(-pairs // tuning().most_parts))
+    return max(MIN_PART_PAIRS, -(-pairs // MAX_PARTS))
 
 
 def split_length(pairs: int) -> int:
@@ -78,15 +86,19 @@ def split_length(pairs: int) -> int:
     Views of 2,400 tiles (960x640) or more of similar length have no split tile. A part does not know which of its
     pixels earlier parts have closed, so in an opaque tile it computes hidden splats once in vain.
     """
-    return tuning().fewest_parts * part_length(pairs)
+    return MIN_PARTS * part_length(pairs)
 
 
 def most_parts_of(room: int) -> int:
     """Most parts that up to ``room`` pairs of a view can need; 0 if no tile can be long enough for some."""
-    choices = tuning()
-    most = min(choices.most_parts, room // choices.shortest_part)
+    most = min(MAX_PARTS, room // MIN_PART_PAIRS)
     # In fours, as memory is laid out (arena.py).
-    return -(-most // 4) * 4 if most >= choices.fewest_parts else 0
+    return -(-most // 4) * 4 if most >= MIN_PARTS else 0
+
+
+def split_rule() -> tuple[int, int, int]:
+    """Return least pairs of a part, most parts of a view, and fewest parts of a tile that is split."""
+    return MIN_PART_PAIRS, MAX_PARTS, MIN_PARTS
 
 
 @jit
@@ -107,21 +119,6 @@ def part_begin(begin, end, count, i):
     """Where the i-th of a tile's ``count`` parts begins; they differ by one pair at most."""
     pairs, count = end - begin, tl.maximum(count, 1)
     return begin + i * (pairs // count) + tl.minimum(i, pairs % count)
-
-
-@jit
-def thin_parts(
-    records, pair_rows, tiles, begins, ends, nexts, products, width, height, tiles_x, alpha_max, transmittance_min,
-    GATED: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """Writes what each part lets through alone, but for the last parts of tiles, behind which nothing is blended."""
-    tl.static_assert(BLOCK == 1)
-    part = tl.program_id(0)
-    if part + 1 < tl.load(nexts + part):
-        thin_pairs(
-            records, pair_rows, tl.load(begins + part), tl.load(ends + part), tl.load(tiles + part), part, products,
-            width, height, tiles_x, alpha_max, transmittance_min, GATED,
-        )  # fmt: skip
 
 
 @jit

@@ -2,23 +2,21 @@
 
 from dataclasses import dataclass
 
-import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.ops.triton import blend, blend_backward
 from sparsestreet.ops.triton.compose import Split, compose
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.lists import Lists
-from sparsestreet.ops.triton.parts import PartLayers, Parts, thin_parts
+from sparsestreet.ops.triton.parts import PartLayers, Parts
 from sparsestreet.ops.triton.screen import Screen, given_or
-from sparsestreet.ops.triton.tuning import tuning
 from sparsestreet.ops.triton.view import KernelView
 
 ONE_WARP = {"num_warps": 1}
-WHOLE_TILES = {"PARTS": False, "TOGETHER": False}
-PARTS = {"PARTS": True, "TOGETHER": False}
-TOGETHER = {"PARTS": False, "TOGETHER": True}
+WHOLE_TILES = {"REST": False, "TOGETHER": False}
+TOGETHER = {"REST": False, "TOGETHER": True}
+REST = {"REST": True, "TOGETHER": False}
 
 
 @dataclass(frozen=True)
@@ -63,66 +61,48 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
         neighbors, split = (parts.firsts, parts.nexts, part.products), Split(parts, part, limit)
     tables = (screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers)
     numbers = (*sizes(view, parts), view.settings.alpha_max, limit)
-    tiles, part_count, choices = lists.order.shape[0], numbers[3], tuning()
-    options = ONE_WARP | {"maxnreg": blend.registers(view.exclusive, choices.staged, screen.gated)}
+    tiles, part_count = lists.order.shape[0], numbers[3]
+    options = ONE_WARP | {"maxnreg": blend.registers(screen.gated)}
 
-    def blend_each(count: int, work: dict[str, bool], rest: bool = False) -> None:
+    def blend_each(count: int, work: dict[str, bool]) -> None:
         launch(
             blend.blend_tiles, count, 1, *tables, *numbers,
-            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=choices.staged, GATED=screen.gated,
-            **work, options=options,
+            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, GATED=screen.gated, **work, options=options,
         )  # fmt: skip
 
     if parts is None or part is None:
         blend_each(tiles, WHOLE_TILES)
-    elif choices.two_launches:
-        blend_each(tiles + part_count, TOGETHER)
-        blend_each(part_count, PARTS, rest=True)
     else:
-        blend_each(tiles, WHOLE_TILES)
-        launch(
-            thin_parts, part_count, 1,
-            screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, parts.nexts, part.products,
-            *pixel_arguments(view), limit, GATED=screen.gated, options=ONE_WARP,
-        )  # fmt: skip
-        blend_each(part_count, PARTS)
+        # Whole tiles, first parts and what later ones let through; then these. In a launch of its own, each would wait
+        # for the one before.
+        blend_each(tiles + part_count, TOGETHER)
+        blend_each(part_count, REST)
     alpha = compose(rgb, transmittance, depth_sum, background, last, split)
     return Layers(rgb, alpha, depth_sum, Ends(transmittance, last, part))
 
 
 def differentiate_view(
     screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
-) -> tuple[Float[Tensor, "p s"], UInt8[Tensor, " p"] | None]:
-    """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means.
-
-    Also which slots are written, as bytes; None: all."""
+) -> Float[Tensor, "p s"]:
+    """Return a slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
     slots = passed.new_empty(lists.sizes.pairs, blend_backward.slot_length(screen.gated))
-    walked = slots.new_zeros(len(slots), dtype=torch.uint8) if tuning().marked_slots else None
     parts, part = lists.parts, ends.parts
+    part_count = 0 if parts is None else len(parts)
     nexts, part_layers = lists.order, (passed, passed, passed, lists.order)
     if parts is not None and part is not None:
         nexts, part_layers = parts.nexts, (part.rgb, part.depth_sum, part.transmittance, part.lasts)
 
-    def differentiate_each(count: int, work: dict[str, bool]) -> None:
-        launch(
-            blend_backward.blend_tiles_backward, count, 1,
-            screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
-            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, given_or(walked, lists.order),
-            *sizes(view, parts), view.settings.alpha_max,
-            DEPTH=depth, ABSOLUTE=absolute, MARKED=walked is not None, GATED=screen.gated, **work,
-            options=ONE_WARP | {"maxnreg": blend_backward.registers(depth, screen.gated)},
-        )  # fmt: skip
+    launch(
+        blend_backward.blend_tiles_backward, len(lists.order) + part_count, 1,
+        screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
+        v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots,
+        *sizes(view, parts), view.settings.alpha_max,
+        DEPTH=depth, ABSOLUTE=absolute, GATED=screen.gated, TOGETHER=parts is not None,
+        options=ONE_WARP | {"maxnreg": blend_backward.registers(depth, screen.gated)},
+    )  # fmt: skip
 
-    tiles = len(lists.order)
-    if parts is None:
-        differentiate_each(tiles, WHOLE_TILES)
-    elif tuning().two_launches:
-        differentiate_each(tiles + len(parts), TOGETHER)
-    else:
-        differentiate_each(tiles, WHOLE_TILES)
-        differentiate_each(len(parts), PARTS)
-    return slots, walked
+    return slots
 
 
 def work_tables(lists: Lists) -> tuple[Tensor, ...]:

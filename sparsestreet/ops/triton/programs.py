@@ -29,17 +29,17 @@ def place_of(ahead, part_count, TOGETHER: tl.constexpr):
 @jit
 def work_of(
     begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count,
-    PARTS: tl.constexpr, TOGETHER: tl.constexpr,
+    REST: tl.constexpr, TOGETHER: tl.constexpr,
 ):  # fmt: skip
     """Tile, number of the part, first pair, the one after the last, and whether it is a part.
 
-    PARTS: parts alone; TOGETHER: whole tiles and parts; else whole tiles alone."""
+    REST: parts alone; TOGETHER: whole tiles and parts; else whole tiles alone."""
     place, part, is_part = place_of(ahead, part_count, TOGETHER)
     if TOGETHER:
         tile = tl.where(is_part, tl.load(part_tiles + part), tl.load(order + place))
         begin = tl.where(is_part, tl.load(part_begins + part), tl.load(begins + tile))
         end = tl.where(is_part, tl.load(part_ends + part), tl.load(ends + tile))
-    elif PARTS:
+    elif REST:
         tile, begin, end = tl.load(part_tiles + part), tl.load(part_begins + part), tl.load(part_ends + part)
     else:
         tile = tl.load(order + place)

@@ -133,9 +133,9 @@ class _Blend(torch.autograd.Function):
         cotangents, ends = Cotangents(v_rgb, v_passed, v_depth_sum), Ends(transmittance, ctx.lasts, ctx.parts)
         plain = view.settings.plain_gradients
         absolute = ctx.needs_input_grad[5] and not plain
-        gradients, walked = differentiate_view(screen, view, ends, cotangents, absolute)
+        gradients = differentiate_view(screen, view, ends, cotangents, absolute)
         sums = transmittance.new_empty(len(fields[0]), gradients.shape[1])
-        _sum_slots(gradients, lists, sums, 16, tl.float32, walked)
+        _sum_slots(gradients, lists, sums, 16, tl.float32)
         outputs = [torch.empty_like(field) for field in fields]
         v_screen = transmittance.new_empty(len(fields[0]), 2)
         launch(
@@ -156,13 +156,11 @@ def _of_gates(screen: Screen, sums: Float[Tensor, "n s"]) -> Float[Tensor, " n"]
     return torch.where(screen.tile_counts > 0, sums[:, blend_backward.GATE_PLACE], 0.0)
 
 
-def _sum_slots(
-    values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype, walked: Tensor | None = None
-) -> None:
+def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype) -> None:
     launch(
         slots.sum_slots, lists.sizes.rows, slots.ROWS,
-        values, given_or(walked, lists.rows), lists.rows, lists.row_ends, lists.tile_counts, sums, lists.sizes.rows,
-        COUNT=values.shape[1], PADDED=padded, SUM=kind, MARKED=walked is not None, options=slots.OPTIONS,
+        values, lists.rows, lists.row_ends, lists.tile_counts, sums, lists.sizes.rows,
+        COUNT=values.shape[1], PADDED=padded, SUM=kind, options=slots.OPTIONS,
     )  # fmt: skip
 
 

@@ -15,12 +15,10 @@ STEP = constant(4)
 
 @partial(jit, do_not_specialize=["visible"])
 def sum_slots(
-    slots, walked, rows, row_ends, tile_counts, sums, visible,
-    COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, MARKED: tl.constexpr, BLOCK: tl.constexpr,
+    slots, rows, row_ends, tile_counts, sums, visible,
+    COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``sums[row, :COUNT]`` of each visible row, in the type SUM; PADDED: COUNT rounded up to a power of two.
-
-    MARKED: of the slots that are marked in ``walked``; the others are not written."""
+    """``sums[row, :COUNT]`` of each visible row, in the type SUM; PADDED: COUNT rounded up to a power of two."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = rank < visible
     count = tl.load(tile_counts + rank, given, 0)
@@ -31,10 +29,7 @@ def sum_slots(
     for k in range(0, tl.max(count, 0), STEP):
         wanted, values = (), ()
         for i in tl.static_range(STEP):
-            mask = k + i < count
-            if MARKED:
-                mask = tl.load(walked + first + k + i, mask, 0) != 0
-            wanted += (mask,)
+            wanted += (k + i < count,)
         for i in tl.static_range(STEP):
             mask = wanted[i][:, None] & (field < COUNT)[None, :]
             values += (tl.load(slot + (k + i) * COUNT, mask, 0.0),)

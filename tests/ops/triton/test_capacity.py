@@ -9,7 +9,6 @@ from sparsestreet.on_its_way import OnItsWay
 from sparsestreet.ops import PairLimitError, SplatSettings, splat
 from sparsestreet.ops.triton import capacity, compose, lists, order, pixels, screen
 from sparsestreet.ops.triton.sizes import Room
-from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -24,6 +23,7 @@ from tests.ops.scenes import (
     render,
 )
 from tests.ops.triton.recording import record_launches
+from tests.ops.triton.splitting import Rule, split_by
 
 DEVICE = device_of("triton")
 VIEW = camera(19, 17)
@@ -38,7 +38,7 @@ def scene() -> Gaussians:
 
 def drawn(room: Room | None) -> dict[str, torch.Tensor]:
     """Images and gradients with that guess, in short parts."""
-    with pytest.MonkeyPatch.context() as patch, tuned(Tuning(shortest_part=2, fewest_parts=2)):
+    with pytest.MonkeyPatch.context() as patch, split_by(Rule(min_part_pairs=2, min_parts=2)):
         patch.setattr(capacity, "predicted", lambda *_: room)
         result = render(scene(), VIEW, "triton", torch.float32)
     return result.images | result.gradients
