@@ -81,7 +81,7 @@ demo: $(VENV)/.ok ## a synthetic street, trained plain and pruned: one table, pi
 
 bench: $(VENV)/.ok ## what accuracy costs in time: records and figures
 	$(BIN)/sparsestreet bench blend
-	$(BIN)/sparsestreet bench knobs
+	$(BIN)/sparsestreet bench settings
 	$(BIN)/sparsestreet bench scaling
 
 # Two runs beside each other, a thread each; what stands is skipped. What fails stands in the tables.

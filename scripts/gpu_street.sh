@@ -45,6 +45,6 @@ esac
 # Frames a second before and after pruning, at the size of training and at twice that; gsplat beside, where it is.
 for run in "$SWEEP"/*_seed*; do
   timed="$OUT/$(basename "$run")"
-  [ -f "$timed/gpu.jsonl" ] || "$PYTHON" -m sparsestreet bench gpu --street "$run" --enlarge 2 --out "$timed" || exit
+  [ -f "$timed/gpu.jsonl" ] || "$PYTHON" -m benchmarks.gpu "street=$run" enlarge=2 "out=$timed" || exit
 done
 echo "all runs are finished: $OUT"

@@ -12,6 +12,13 @@ from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import splat
 from sparsestreet.types import Camera, Gaussians
 
+MIN_PSNR = 60.0
+"""Least PSNR of agreement, dB. Fast-math exponentials move a sample over the cut-off 1/255 in some pixels.
+
+If every thousandth pixel changed by 1/255, PSNR would be 78 dB."""
+MAX_GRADIENT_ERROR = 5e-3
+"""Largest relative L2 of a group. gsplat recovers transmittance by dividing: errors to 2e-3 in saturated pixels."""
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -89,3 +96,11 @@ def gradient_error(gradient: Tensor, truth: Tensor) -> GradientError:
     # kthvalue, because torch.quantile refuses more than 2^24 rows.
     worst = float(rows.kthvalue(max(1, math.ceil(0.999 * len(rows)))).values)
     return GradientError(whole / scale, worst / (scale / math.sqrt(len(rows))))
+
+
+def agrees(error: Errors) -> bool:
+    """Tell whether images and gradients of two float32 renderers agree within MIN_PSNR and MAX_GRADIENT_ERROR."""
+    if error.image.psnr is not None and error.image.psnr < MIN_PSNR:
+        return False
+    groups = [group.relative_l2 for group in error.gradients.values()]
+    return all(value is not None and value <= MAX_GRADIENT_ERROR for value in groups)

@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from sparsestreet.bench.effects import DISTORTION, ROTATION, TRANSLATION
-from sparsestreet.bench.frustum import frustum_camera
 from sparsestreet.bench.records import RecordFile
-from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.street import proxy_street
+from sparsestreet.bench.scenes import DISTORTION, ROTATION, TRANSLATION, Size, frustum_camera, proxy_street
 from sparsestreet.bench.timing import TimeSpread, TimingBudget, spread
 from sparsestreet.evaluation.speed import frame_image
 from sparsestreet.scene.effects import Cost, Effect, EffectSettings, Finding

@@ -1,7 +1,7 @@
 """The figures of the measurements (matplotlib without a display): SVG for documents, PNG for looking."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
-
-from sparsestreet.bench.fit import Line
 
 Record = dict[str, Any]
 """A line of a file of records, as JSON has it."""
@@ -222,29 +220,6 @@ def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.4},
             zorder=4,
         )
-
-
-def draw_scaling(
-    work: Sequence[float], times: Mapping[str, Sequence[float]], lines: dict[str, Line], folder: Path
-) -> list[Path]:
-    """Milliseconds of each part against (splat, tile) pairs, with its straight line; both axes logarithmic."""
-    figure = Figure(figsize=(7.2, 4.6), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    dense = [min(work) * (max(work) / min(work)) ** (step / 60) for step in range(61)]
-    for (name, values), color in zip(times.items(), ("#0072B2", "#D55E00", "#009E73"), strict=False):
-        line = lines[name]
-        label = f"{name}: {line.intercept:.3g} ms + {1e6 * line.slope:.3g} ns a pair, R² = {line.r_squared:.4f}"
-        axes.plot(dense, [line.at(pairs) for pairs in dense], color=color, linewidth=1.2, label=label)
-        axes.scatter(work, values, color=color, s=30, zorder=3)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.set_xlabel("(splat, tile) pairs")
-    axes.set_ylabel("median time, ms")
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8)
-    return save_figure(figure, folder, "scaling")
 
 
 def save_figure(figure: Figure, folder: Path, name: str) -> list[Path]:

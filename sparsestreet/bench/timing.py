@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Workspace, idle_workspaces
+from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Workspace, idle_workspaces
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import splat
 from sparsestreet.phases import clock_of
@@ -65,6 +65,10 @@ class TimingBudget:
             if done >= self.least and time.perf_counter() - start > self.seconds:
                 return
             run()
+
+
+ONCE = TimingBudget(repeats=2, least=1)
+"""Enough to see that something runs."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +174,7 @@ def work_of(
     if backend == "reference":
         return None, None
     if backend == "triton":
-        from sparsestreet.ops.triton.work import count_work  # Triton is imported only where it is used
+        from sparsestreet.ops.triton.counters import count_work  # Triton is imported only where it is used
 
         return count_work(gaussians, camera, settings)
     with torch.no_grad():

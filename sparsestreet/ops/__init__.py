@@ -1,15 +1,13 @@
 """The splat op: one signature, a dense reference, a fast CPU backend and a Triton one. In reading order:
 
 1. The signature. ``splat`` takes Gaussians and a camera, and returns a differentiable Rendering. ``settings`` holds its
-   knobs, ``validate`` checks its inputs, ``guards`` counts the rows that it does not draw. ``compiling`` keeps
-   torch.compile out.
+   knobs, ``validate`` checks its inputs, ``guards`` counts the rows that it does not draw.
 2. The backends. ``backend`` chooses one, ``raster`` is what each returns. ``reference`` is the truth, ``cpu`` is in
-   C++,
-   ``triton`` for GPUs. All follow the formula in ``spherical_harmonics``.
-3. Steps around the op, in torch and as fused kernels (``fused`` chooses). ``activate`` turns the rows of all nodes into
-   Gaussians, and ``poses`` places boxes. ``sky`` adds the sky behind the splats; its geometry is in ``cube_map``.
-   ``ssim`` is D-SSIM (``ssim_window`` its window). ``visible_adam`` steps the rows that were seen, ``adam`` those
-   whose gradient is finite.
+   C++, ``triton`` for GPUs. All follow the formula in ``spherical_harmonics``.
+3. Steps around the op, in torch and as fused kernels (``backend`` chooses). ``activate`` turns the rows of all nodes
+   into Gaussians, and ``poses`` places boxes. ``sky`` adds the sky behind the splats; its geometry is in ``cube_map``.
+   ``ssim`` is D-SSIM (``ssim_window`` its window). ``adam`` steps the rows that were seen, or those whose gradient is
+   finite.
 """
 
 from sparsestreet.ops.backend import resolve_backend

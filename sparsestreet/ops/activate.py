@@ -7,8 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.ops.compiling import disable_compile
-from sparsestreet.ops.fused import fused_backend
+from sparsestreet.ops.backend import disable_compile, fused_backend
 from sparsestreet.ops.raw import LEARNED, OPACITY_LOGIT_LIMIT, Placement, RawGaussians
 from sparsestreet.types import Gaussians
 
@@ -23,12 +22,12 @@ def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "a
     few dozen operations. Two runs agree to the last bit, except with torch on a GPU, which sums the gradients of poses
     by atomics.
 
-    ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend`.
+    ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.backend.fused_backend`.
     """
     numbers = [tensor for part in parts for tensor in part.tensors()[:LEARNED] if tensor is not None]
     chosen = fused_backend(backend, *numbers)
     if chosen == "cpu":
-        from sparsestreet.ops.cpu.activate import activate as cpu_activate
+        from sparsestreet.ops.cpu.rows import activate as cpu_activate
 
         return cpu_activate(parts, sh_degree, OPACITY_LOGIT_LIMIT)
     if chosen == "triton":

@@ -1,15 +1,126 @@
-"""One step of Adam, in place, for all rows whose gradient is finite; a row with a NaN or an infinity in it rests.
+"""Step rows of a parameter by Adam, in place: those whose gradient is finite, or those that a view has seen.
 
-Adam would write the number into the row's moments, from where it never leaves. Kernels look at a gradient that they
-read anyway, so that this costs no pass over it. Written from Adam's formula (Kingma & Ba 2015, algorithm 1).
+Adam would write a NaN into a row's moments, from where it never leaves, so such a row rests. Kernels look at a gradient
+that they read anyway, so that this costs no pass over it. A view draws a part of a scene's rows, and Adam would read
+and write the moments of all: Taming 3DGS (Mallick et al. 2024) and gsplat's SelectiveAdam step only seen rows. Written
+from Adam's formula (Kingma & Ba 2015, algorithm 1).
 """
 
-import torch
-from jaxtyping import Float, Int64
-from torch import Tensor
+import math
+from ctypes import byref
+from dataclasses import dataclass
 
-from sparsestreet.ops.fused import fused_backend
-from sparsestreet.ops.visible_adam import AdamStep, adam_step_, check_shapes
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+from torch.autograd.graph import increment_version
+
+from sparsestreet.ops.backend import fused_backend
+from sparsestreet.ops.cpu import library as native
+from sparsestreet.ops.cpu.library import FASTEST_VARIANT
+
+
+def step_rows_in_library_(
+    parameter: Tensor,
+    gradient: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    refused: Tensor,
+    *,
+    width: int,
+    size: float,
+    root: float,
+    betas: tuple[float, float],
+    eps: float,
+    variant: int = FASTEST_VARIANT,
+) -> None:
+    """``adam.adam_rows_`` on contiguous tensors of one dtype; ``size`` and ``root`` are those of its AdamStep."""
+    rows = native.CAdamRows(
+        rows=parameter.numel() // width,
+        width=width,
+        parameter=parameter.data_ptr(),
+        gradient=gradient.data_ptr(),
+        exp_avg=exp_avg.data_ptr(),
+        exp_avg_sq=exp_avg_sq.data_ptr(),
+        share=1 - betas[0],
+        beta=betas[1],
+        square_share=1 - betas[1],
+        root=root,
+        eps=eps,
+        size=size,
+        threads=native.thread_count(),
+        refused=refused.data_ptr(),
+    )
+    native.load_library().splat_adam(parameter.dtype == torch.float64, variant, byref(rows))
+    # Autograd does not see what the library writes, but a graph that holds old values must refuse its backward pass.
+    increment_version((parameter, exp_avg, exp_avg_sq))
+
+
+@dataclass(frozen=True)
+class AdamStep:
+    """The numbers of one step."""
+
+    count: int
+    """Number of this step, from 1, for the whole parameter. So all rows have the bias corrections of a row that was
+    seen at every step, as in dense Adam. A row that is first seen late moves by (1 - beta1) / sqrt(1 - beta2) learning
+    rates (3.2 with torch's betas), while Adam's first step moves by one."""
+    lr: float
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-15
+
+    @property
+    def size(self) -> float:
+        """The learning rate divided by the first moment's bias correction."""
+        return self.lr / (1 - self.betas[0] ** self.count)
+
+    @property
+    def root(self) -> float:
+        """Square root of the second moment's bias correction."""
+        return math.sqrt(1 - self.betas[1] ** self.count)
+
+
+@torch.no_grad()
+def adam_step_(
+    parameter: Float[Tensor, "n ..."],
+    gradient: Float[Tensor, "n ..."],
+    exp_avg: Float[Tensor, "n ..."],
+    exp_avg_sq: Float[Tensor, "n ..."],
+    visible: Bool[Tensor, " n"],
+    step: AdamStep,
+    *,
+    backend: str = "auto",
+) -> None:
+    """Updates ``parameter`` and both moments of ``visible`` rows by Adam; other rows keep every bit.
+
+    With all rows visible it is torch.optim.Adam without weight decay. ``backend``: "torch", "triton", or "auto" for
+    the one that suits the tensors. Raises as :func:`sparsestreet.ops.backend.fused_backend` does, and ValueError for
+    tensors of different shapes.
+    """
+    check_shapes(parameter, gradient, exp_avg, exp_avg_sq)
+    if fused_backend(backend, parameter, exp_avg, exp_avg_sq, choices=("torch", "triton")) == "triton":
+        from sparsestreet.ops.triton.adam import step_rows_
+
+        moments = (exp_avg, exp_avg_sq)
+        step_rows_(
+            parameter, gradient.contiguous(), *moments, visible.contiguous(),
+            size=step.size, root=step.root, betas=step.betas, eps=step.eps,
+        )  # fmt: skip
+        return
+    rows = visible.nonzero()[:, 0]
+    seen, value = gradient.index_select(0, rows), parameter.index_select(0, rows)
+    first = exp_avg.index_select(0, rows).lerp_(seen, 1 - step.betas[0])
+    second = exp_avg_sq.index_select(0, rows).mul_(step.betas[1]).addcmul_(seen, seen, value=1 - step.betas[1])
+    value.addcdiv_(first, second.sqrt().div_(step.root).add_(step.eps), value=-step.size)
+    for whole, part in ((parameter, value), (exp_avg, first), (exp_avg_sq, second)):
+        whole.index_copy_(0, rows, part)
+
+
+def check_shapes(*tensors: Tensor) -> None:
+    """Raises ValueError unless a parameter, its gradient and both moments have one shape."""
+    shapes = [tuple(tensor.shape) for tensor in tensors]
+    if len(set(shapes)) != 1:
+        raise ValueError(f"parameter, gradient and moments must have one shape, got {shapes}: resize them together")
+
 
 NONE = torch.iinfo(torch.int64).max
 """In place of the first refused row where there is none."""
@@ -54,10 +165,10 @@ def adam_rows_(
         _in_torch(parameter, gradient, exp_avg, exp_avg_sq, refused, step, width)
         return
     if chosen == "cpu":
-        from sparsestreet.ops.cpu.adam import step_rows_
+        pass
     else:
-        from sparsestreet.ops.triton.adam import step_finite_rows_ as step_rows_
-    step_rows_(
+        pass
+    step_rows_in_library_(
         parameter, gradient.contiguous(), exp_avg, exp_avg_sq, refused,
         width=width, size=step.size, root=step.root, betas=step.betas, eps=step.eps,
     )  # fmt: skip

@@ -7,9 +7,15 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from sparsestreet.ops.reference import check_dtype, on_screen
-from sparsestreet.ops.reference.footprint import sigma_points_held, slopes_held
-from sparsestreet.ops.reference.projection import COMPENSATION_FLOOR, axes_in_camera, row_reasons, to_camera
-from sparsestreet.ops.reference.reasons import Reason
+from sparsestreet.ops.reference.projection import (
+    COMPENSATION_FLOOR,
+    Reason,
+    axes_in_camera,
+    row_reasons,
+    sigma_points_held,
+    slopes_held,
+    to_camera,
+)
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_structure, check_values
 from sparsestreet.types import Camera, Gaussians

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
-from sparsestreet.ops.fused import fused_backend
+from sparsestreet.ops.backend import fused_backend
 from sparsestreet.ops.raw import Poses
 
 
@@ -26,13 +26,13 @@ def poses_at(
     which instances are present. The translation is interpolated linearly, the rotation by slerp along the shorter arc.
 
     The C++ library and Triton need one operation for all instances, forward and backward; torch needs dozens.
-    ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.fused.fused_backend` does.
+    ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.backend.fused_backend` does.
     """
     table = keyframes
     numbers = (table.times, table.quaternions, table.translations, table.spans, rotation_deltas, translation_deltas)
     chosen = fused_backend(backend, *numbers)
     if chosen == "cpu":
-        from sparsestreet.ops.cpu.poses import poses_at as cpu_poses
+        from sparsestreet.ops.cpu.rows import poses_at as cpu_poses
 
         return Poses(*cpu_poses(table, rotation_deltas, translation_deltas, time, max_gap))
     if chosen == "triton":

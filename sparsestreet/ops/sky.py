@@ -8,10 +8,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import ray_directions
-from sparsestreet.ops.compiling import disable_compile
-from sparsestreet.ops.cpu import sky as cpu
+from sparsestreet.ops.backend import disable_compile, fused_backend
+from sparsestreet.ops.cpu import images as cpu
 from sparsestreet.ops.cube_map import colors_along
-from sparsestreet.ops.fused import fused_backend
 from sparsestreet.ops.validate import check_camera
 from sparsestreet.types import Camera
 

@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.ops import reference
-from sparsestreet.ops.backend import resolve_backend
-from sparsestreet.ops.compiling import disable_compile
+from sparsestreet.ops.backend import disable_compile, resolve_backend
 from sparsestreet.ops.cpu import rasterizer as cpu
 from sparsestreet.ops.raster import LEAST_ALPHA, Raster
 from sparsestreet.ops.settings import SplatSettings

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from sparsestreet.ops.cpu import ssim as cpu_ssim
-from sparsestreet.ops.fused import fused_backend
+from sparsestreet.ops.backend import fused_backend
+from sparsestreet.ops.cpu import images as cpu_ssim
 from sparsestreet.ops.ssim_window import C1, C2, WINDOW, window
 
 BACKENDS = ("auto", "torch", "cpu", "triton")
@@ -21,7 +21,7 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backen
     """Mean SSIM over the pixels whose window lies inside the image. Gradients go to the image only.
 
     ``backend``: "torch", "cpu" (C++), "triton", or "auto" for the one that suits the tensors. Raises as
-    :func:`sparsestreet.ops.fused.fused_backend` does, and ValueError below 11x11 pixels or for different shapes.
+    :func:`sparsestreet.ops.backend.fused_backend` does, and ValueError below 11x11 pixels or for different shapes.
     """
     if backend not in BACKENDS:
         raise ValueError(f"no backend {backend!r} of SSIM: choose one of {BACKENDS}")

@@ -9,7 +9,7 @@
 4. ``callbacks`` decide when rows change: density control, masks, pruning. Strategies, masks and rules decide what. All
    changes go through ``callbacks.resizing``, which applies a ``RowPlan`` to values and optimizer moments. Further
    callbacks write the files of a run and watch;
-5. ``schedule`` has the intervals and milestones, ``optimizer`` the groups of learning rates, ``row_adam`` the Adam
-   that leaves rows alone whose gradient is not finite (``quarantine`` counts them), ``visible_adam`` one that moves
+5. ``schedule`` has the intervals and milestones, ``optimizer`` the groups of learning rates, ``adam`` the Adam
+   that leaves rows alone whose gradient is not finite (``quarantine`` counts them), and one that moves
    only the rows a step has seen, ``curves`` the curves of a resumed run.
 """

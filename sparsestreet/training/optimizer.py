@@ -8,8 +8,7 @@ import torch
 
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.training.row_adam import RowAdam
-from sparsestreet.training.visible_adam import VisibleAdam
+from sparsestreet.training.adam import RowAdam, VisibleAdam
 
 
 @dataclass(frozen=True)

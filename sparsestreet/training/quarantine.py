@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from sparsestreet.on_its_way import OnItsWay, on_its_way
+from sparsestreet.training.adam import RefusedRows
 from sparsestreet.training.finite import NotFiniteError, seen_from
-from sparsestreet.training.row_adam import RefusedRows
 from sparsestreet.types import View
 
 log = logging.getLogger(__name__)

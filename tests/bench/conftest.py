@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.bench.scenes import frustum_camera, frustum_gaussians
 from sparsestreet.bench.timing import leaves
 from sparsestreet.types import Gaussians
 

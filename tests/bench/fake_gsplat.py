@@ -4,7 +4,7 @@ from types import ModuleType
 
 import torch
 
-from sparsestreet.bench import gsplat_peer
+from benchmarks import gsplat_baseline
 from sparsestreet.ops import splat
 from sparsestreet.types import Camera, Gaussians
 
@@ -25,7 +25,7 @@ def fake_gsplat(brightness: float = 1.0) -> ModuleType:
         assert given["colors"].shape[1] == (given["sh_degree"] + 1) ** 2
         fields = ("means", "quats", "scales", "opacities", "colors")
         camera = Camera(given["viewmats"][0], given["Ks"][0], given["width"], given["height"])
-        rendering = splat(Gaussians(*(given[name] for name in fields)), camera, settings=gsplat_peer.SETTINGS)
+        rendering = splat(Gaussians(*(given[name] for name in fields)), camera, settings=gsplat_baseline.SETTINGS)
 
         class Means:
             absgrad = property(lambda self: rendering.screen_offsets.grad[None])

@@ -8,9 +8,12 @@ import torch
 
 from sparsestreet.bench import blend
 from sparsestreet.bench.records import RecordFile, read_records
-from sparsestreet.bench.scenes import Size
+from sparsestreet.bench.scenes import Size, frustum_camera, frustum_gaussians
 from sparsestreet.bench.timing import OpTimes, TimeSpread, TimingBudget
+from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops.reference import on_screen, visible_rows
 from tests.bench.test_records import PROVENANCE
+from tests.ops.scenes import camera, cast, cotangents, random_gaussians, relative_error
 
 ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 
@@ -41,15 +44,15 @@ def test_what_is_timed_is_done(monkeypatch):
             now[0] += seconds
             done.append((name, width, height, settings, torch.is_grad_enabled(), [one.shape for one in cotangent]))
 
-        monkeypatch.setattr(blend.torch_tiles, name, work)
+        monkeypatch.setattr(blend, name, work)
 
-    peer("blend", 0.003)
+    peer("blend_torch", 0.003)
     peer("blend_gradients", 0.007)
     gaussians, camera = blend._scene(Size(48, 32, 50))
     times = blend.time_torch(gaussians, camera, TimingBudget(repeats=3, seconds=100.0))
     found = {name: (one.median, one.minimum, one.repeats) for name, one in times.items()}
     assert found == {"forward": pytest.approx((3.0, 3.0, 3)), "both": pytest.approx((7.0, 7.0, 3))}
-    forward = ("blend", 48, 32, blend.SETTINGS, False, [])
+    forward = ("blend_torch", 48, 32, blend.SETTINGS, False, [])
     both = ("blend_gradients", 48, 32, blend.SETTINGS, True, [(32, 48, 3)])
     assert done == [forward] * 5 + [both] * 5
 
@@ -63,7 +66,7 @@ def test_ties_are_counted_apart(monkeypatch):
     monkeypatch.setattr(
         blend, "splat", lambda *given, **how: asked.append((given, how)) or SimpleNamespace(rgb=ours)
     )  # fmt: skip
-    monkeypatch.setattr(blend.torch_tiles, "blend", lambda *given: asked.append(given[1:]) or (theirs, None))
+    monkeypatch.setattr(blend, "blend_torch", lambda *given: asked.append(given[1:]) or (theirs, None))
     found = blend.image_difference(gaussians, camera)
     assert (found.pixels, found.ties, found.largest) == (6, 1, 0.25)
     assert found.largest_without_ties == pytest.approx(1e-6)
@@ -100,3 +103,47 @@ def test_a_record_as_lines():
         "  blend forward + backward, torch over C++: 20 times",
         "  image difference 1.0e-06, except 3 of 3072 pixels at the cut-off (up to 2.5e-01)",
     ]
+
+
+pytestmark = pytest.mark.lengthy
+SETTINGS = SplatSettings()
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        SETTINGS,
+        SplatSettings(stop="exclusive", transmittance_min=0.1),
+        SplatSettings(max_sigma=1.5),
+        SplatSettings(half_colors=True, depth_bits=12),
+    ],
+)
+def test_image_and_gradients(settings):
+    view = camera(37, 29)
+    gaussians = random_gaussians(200, view)
+    splats = on_screen(gaussians, visible_rows(gaussians, view, settings), view, settings)
+    colors, transmittance = blend.blend_torch(splats, 37, 29, settings)
+    leaves = cast(gaussians, torch.float64, requires_grad=True)
+    truth = splat(leaves, view, settings=settings, backend="reference")
+    assert (colors - truth.rgb).abs().max() < 1e-12
+    assert (1 - transmittance - truth.alpha).abs().max() < 1e-12
+    # Through the projection of the reference, with the gradients of the tiles put in at the screen.
+    cotangent = cotangents(view)[0]
+    truth.rgb.backward(cotangent)
+    other = cast(gaussians, torch.float64, requires_grad=True)
+    graph = on_screen(other, visible_rows(other, view, settings), view, settings)
+    gradients = blend.blend_gradients(splats, 37, 29, settings, cotangent)
+    torch.autograd.backward([getattr(graph, name) for name in gradients], list(gradients.values()))
+    for name in ("means", "quaternions", "scales", "opacities", "sh"):
+        assert relative_error(getattr(other, name).grad, getattr(leaves, name).grad) < 1e-10, name
+
+
+def test_cpu_agrees_on_a_large_scene():
+    view = frustum_camera(160, 96)
+    gaussians = frustum_gaussians(6000, view, sigma_pixels=2.0, terms=1)
+    splats = on_screen(gaussians, visible_rows(gaussians, view, SETTINGS), view, SETTINGS)
+    image = splat(gaussians, view, backend="cpu").rgb
+    difference = (image - blend.blend_torch(splats, 160, 96, SETTINGS)[0]).abs().amax(-1)
+    # A splat within rounding of the cut-off is blended by one and not by the other: at most one pixel in thousands.
+    assert (difference > 1e-5).sum() <= 3
+    assert difference.max() < 1 / 255

@@ -10,19 +10,18 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from sparsestreet.bench import figures
+from sparsestreet.bench import figures, scaling
 from sparsestreet.bench.figures import (
     _sparse,
     _steps,
     draw_pareto,
-    draw_scaling,
     forward_time,
     gradient_l2,
     image_rmse,
     save_figure,
     whole_time,
 )
-from sparsestreet.bench.fit import Line
+from sparsestreet.bench.scaling import Line
 from tests.typed import as_a
 
 
@@ -50,9 +49,10 @@ RECORDS = [
 @pytest.fixture
 def saved(monkeypatch) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
-    monkeypatch.setattr(
-        figures, "save_figure", lambda figure, folder, name: drawn.update({name: figure}) or [folder / name]
-    )
+    for module in (figures, scaling):
+        monkeypatch.setattr(
+            module, "save_figure", lambda figure, folder, name: drawn.update({name: figure}) or [folder / name]
+        )
     return drawn
 
 
@@ -143,7 +143,7 @@ def test_marks_of_an_axis_are_1_2_and_5():
 def test_times_against_pairs_with_their_lines(saved, tmp_path):
     work, times = [100.0, 1000.0], {"forward": [2.0, 11.0], "backward": [5.0, 32.0]}
     lines = {"forward": Line(0.01, 1.0, 0.99), "backward": Line(0.03, 2.0, 0.98)}
-    assert draw_scaling(work, times, lines, tmp_path) == [tmp_path / "scaling"]
+    assert scaling.draw_scaling(work, times, lines, tmp_path) == [tmp_path / "scaling"]
     (axes,) = saved["scaling"].axes
     for line, (name, values), dots in zip(axes.get_lines(), times.items(), axes.collections, strict=True):
         x, y = (np.asarray(part) for part in line.get_data())

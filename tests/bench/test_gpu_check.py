@@ -130,7 +130,7 @@ elif " train " in given:
     Path(out, "records", "summary.json").write_text("{}")
     trained.touch()
     time.sleep(0.5)
-elif " bench gpu" in given:
+elif " benchmarks.gpu" in given:
     call("bench")
     stubs = [Path(path, "gsplat.py") for path in os.environ["PYTHONPATH"].split(os.pathsep)]
     print("sparsestreet triton", "alone" if any(stub.is_file() for stub in stubs) else "beside gsplat")

@@ -60,9 +60,9 @@ def test_a_finished_sweep_is_reported_and_each_run_is_timed_once(tmp_path):
     assert said.returncode == 0, said.stderr
     assert calls[0] == "-m sparsestreet train +sweep=real_size trainer=gpu seed=1"
     assert calls[1] == f"-m sparsestreet report sweep={SWEEP}"
-    timed = {call.split("--street ")[1].split()[0] for call in calls[2:]}
+    timed = {call.split("street=")[1].split()[0] for call in calls[2:]}
     assert timed == {f"{SWEEP}/streetgs_seed0", f"{SWEEP}/streetgs+paper_seed0"}
-    assert all("bench gpu" in call and "--enlarge 2" in call for call in calls[2:])
+    assert all("-m benchmarks.gpu" in call and "enlarge=2" in call for call in calls[2:])
     of_a_run = {"run.json", "records/summary.json", "curves/metrics.csv"}
     expected = {f"{name}/{file}" for name in ("streetgs_seed0", "streetgs+paper_seed0") for file in of_a_run}
     assert brought_home(tmp_path) == expected  # no scene, no checkpoint

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sparsestreet.bench.accuracy import GradientError, gradient_error, image_error
 from sparsestreet.bench.figures import pareto_front
-from sparsestreet.bench.fit import fit_line
+from sparsestreet.bench.scaling import fit_line
 from sparsestreet.bench.timing import TimingBudget, spread
 
 

@@ -6,10 +6,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.bench.effects import seen_through
-from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
-from sparsestreet.bench.scenes import STACK, Size, bench_scenes, deep_stack, needles_and_giants
-from sparsestreet.bench.street import _CARS, proxy_street
+from sparsestreet.bench.scenes import (
+    _CARS,
+    STACK,
+    Size,
+    bench_scenes,
+    deep_stack,
+    frustum_camera,
+    frustum_gaussians,
+    needles_and_giants,
+    proxy_street,
+    seen_through,
+)
 from sparsestreet.ops import SplatSettings, contribution
 from sparsestreet.ops.reference import visible_rows
 from tests.typed import there

@@ -11,11 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.text import Annotation
 
-from sparsestreet.bench import step, step_figure
-from sparsestreet.bench.floors import Floor, StepWork, floors
+from sparsestreet.bench import step
 from sparsestreet.bench.records import RecordFile, read_records
-from sparsestreet.bench.step import StepWatch, StepWindow, lines, run_step
-from sparsestreet.bench.step_record import PhaseRecord, StepRecord
+from sparsestreet.bench.roofline import Floor, StepWork, floors
+from sparsestreet.bench.step import PhaseRecord, StepRecord, StepWatch, StepWindow, lines, run_step
 from sparsestreet.bench.timing import TimeSpread
 from sparsestreet.phases import PhaseRecorder, WallClock, phase
 from tests.bench.test_records import PROVENANCE
@@ -159,8 +158,8 @@ def test_the_table_of_a_step():
 def test_the_picture_of_a_step(monkeypatch, tmp_path):
     """A bar a phase that takes a hundredth of the step, its floor inside."""
     drawn: list[tuple[Figure, Any, str]] = []
-    monkeypatch.setattr(step_figure, "save_figure", lambda *given: drawn.append(given) or [Path("a.svg")])
-    assert step_figure.draw_step(RECORD, tmp_path) == [Path("a.svg")]
+    monkeypatch.setattr(step, "save_figure", lambda *given: drawn.append(given) or [Path("a.svg")])
+    assert step.draw_step(RECORD, tmp_path) == [Path("a.svg")]
     ((figure, folder, name),) = drawn
     assert (folder, name) == (tmp_path, "step")
     (axes,) = figure.axes

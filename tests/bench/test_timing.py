@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
+from sparsestreet.bench.scenes import frustum_camera, frustum_gaussians
 from sparsestreet.bench.timing import Cotangent, TimingBudget, leaves, time_op, work_of
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.cpu.rasterizer import rasterize

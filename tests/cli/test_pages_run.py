@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.bench import knobs, planted, sweep
+from sparsestreet.bench import settings_sweep
 from sparsestreet.cli.commands.export import export
 from sparsestreet.cli.commands.train import train
 from sparsestreet.scene.edits import objects_of
@@ -100,7 +100,7 @@ def sized(name: str, words: list[str], tiny_street: list[str]) -> list[str]:
         return [*words, *tiny(words, tiny_street), steps]
     if name == "bench":
         options = tiny([], tiny_street) if "step" in words else []
-        return [*(word for word in words if word != "--quick"), "--quick", *options]
+        return [*(word for word in words if word != "quick=true"), "quick=true", *options]
     ports = [word for word in words if not word.startswith("port=")]
     return {
         "effects": [*words, *tiny(words, tiny_street)],
@@ -127,12 +127,10 @@ def ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def measures_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What --quick leaves long: compiled and interpreted kernels, dozens of traced streets."""
-    few = knobs.points()[:2]
-    monkeypatch.setattr(knobs, "points", lambda: few)
-    monkeypatch.setattr(sweep, "backend_points", list)
-    for name, value in (("PLANTS", ()), ("TOGETHER", ()), ("SIZE", SMALL)):
-        monkeypatch.setattr(planted, name, value)
+    """What quick=true leaves long: compiled and interpreted kernels."""
+    few = settings_sweep.points()[:2]
+    monkeypatch.setattr(settings_sweep, "points", lambda: few)
+    monkeypatch.setattr(settings_sweep, "backend_points", list)
 
 
 @pytest.mark.slow
@@ -152,7 +150,7 @@ def test_a_command_of_the_pages_runs(command, place, tiny_street, tmp_path, monk
         ends_at_once(monkeypatch)
     if "sweep=outputs/sweeps/tiny" in words and not Path("outputs/sweeps/tiny").is_dir():
         assert train(["+sweep=tiny", *SWEPT]) == 0
-    run = getattr(importlib.import_module(f"sparsestreet.cli.{name}"), name)
+    run = getattr(importlib.import_module(f"sparsestreet.cli.commands.{name}"), name)
     with unchecked():
         status = run(sized(name, words, tiny_street))
     assert status == 0 or name == "check", capsys.readouterr().err  # which asks whether a GPU can train here

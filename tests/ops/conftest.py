@@ -26,7 +26,7 @@ if INTERPRETED:
 @pytest.fixture(autouse=True)
 def _unknown_views() -> None:
     """A rendering takes the same path whatever was rendered before, in other tests."""
-    capacity = sys.modules.get("sparsestreet.ops.triton.capacity")
+    capacity = sys.modules.get("sparsestreet.ops.triton.lists")
     if capacity is not None:
         capacity.forget()
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.ops.activate import activate
-from sparsestreet.ops.cpu import activate as fused
+from sparsestreet.ops.cpu import rows as fused
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.raw import OPACITY_LOGIT_LIMIT, Placement, Poses, RawGaussians
 from tests.ops.scenes import CPU

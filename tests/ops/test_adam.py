@@ -4,10 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.adam import NONE, adam_rows_
+from sparsestreet.ops.adam import NONE, AdamStep, adam_rows_
 from sparsestreet.ops.backend import has_triton
 from sparsestreet.ops.cpu.library import load_library
-from sparsestreet.ops.visible_adam import AdamStep
 from tests.ops.scenes import device_of, relative_error
 
 BACKENDS = ["torch", "cpu"] + ["triton"] * has_triton()

@@ -5,7 +5,7 @@ import torch
 
 from sparsestreet.ops import contribution, leave_one_out, splat
 from sparsestreet.ops.activate import activate
-from sparsestreet.ops.cpu import library, workspace
+from sparsestreet.ops.cpu import library
 from sparsestreet.ops.cpu.library import (
     LIBRARY_VARIABLE,
     STATUS_OUT_OF_MEMORY,
@@ -85,8 +85,8 @@ def test_what_the_library_answers_backward_is_looked_at(monkeypatch):
 
 def test_a_workspace_that_is_gone_is_not_lent_again():
     # The garbage collector may take a workspace before its lease.
-    lease = workspace.Lease(torch.float64, workspace.FASTEST_VARIANT)
+    lease = library.Lease(torch.float64, library.FASTEST_VARIANT)
     gone = lease.workspace
     gone.__del__()
     del lease
-    assert gone not in workspace.idle_workspaces()
+    assert gone not in library.idle_workspaces()

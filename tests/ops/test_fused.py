@@ -6,9 +6,9 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.ops import fused
+from sparsestreet.ops import backend as fused
 from sparsestreet.ops.activate import activate
-from sparsestreet.ops.fused import fused_backend
+from sparsestreet.ops.backend import fused_backend
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.ops.sky import over_sky
@@ -86,7 +86,10 @@ def test_the_named_implementation_runs(monkeypatch, step, backend):
     def run(*_):
         raise ran
 
-    monkeypatch.setattr(f"sparsestreet.ops.{backend}.{step}", run)
+    module, name = step.split(".")
+    if backend == "cpu":
+        module = "rows" if module in ("activate", "poses") else "images"
+    monkeypatch.setattr(f"sparsestreet.ops.{backend}.{module}.{name}", run)
     with pytest.raises(RuntimeError, match=str(ran)):
         STEPS[step](backend)
 

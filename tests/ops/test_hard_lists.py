@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, contribution, leave_one_out, splat
-from sparsestreet.ops.cpu.workspace import idle_workspaces
+from sparsestreet.ops.cpu.library import idle_workspaces
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, contribution
-from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, idle_workspaces
+from sparsestreet.ops.cpu.library import FASTEST_VARIANT, idle_workspaces
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.scenes import (
     cast,
@@ -55,7 +55,7 @@ def _listed_tiles(backend: str, card: Gaussians, view: Camera, dtype: torch.dtyp
         mine = [workspace for workspace in idle_workspaces() if workspace.key == (dtype, FASTEST_VARIANT)]
         return mine[-1].pair_count()
     if backend == "triton":
-        from sparsestreet.ops.triton.work import count_work
+        from sparsestreet.ops.triton.counters import count_work
 
         return count_work(cast(card, dtype, device=device_of(backend)), view, SplatSettings())[0]
     return None

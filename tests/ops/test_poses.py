@@ -5,7 +5,7 @@ import torch
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.ops.cpu import poses as fused
+from sparsestreet.ops.cpu import rows as fused
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.poses import poses_at
 

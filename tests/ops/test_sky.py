@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
-from sparsestreet.ops import fused, over_sky
+from sparsestreet.ops import backend as fused
+from sparsestreet.ops import over_sky
 from sparsestreet.ops import sky as torch_sky
-from sparsestreet.ops.cpu import sky as cpu
+from sparsestreet.ops.cpu import images as cpu
 from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.phases import PhaseRecorder, WallClock

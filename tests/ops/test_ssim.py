@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.ops import fused
+from sparsestreet.ops import backend as fused
+from sparsestreet.ops.cpu.images import mean_ssim
 from sparsestreet.ops.cpu.library import load_library
-from sparsestreet.ops.cpu.ssim import mean_ssim
 from sparsestreet.ops.ssim import ssim
 from tests.ops.scenes import fill_buffers_with_nan, relative_error, with_threads
 

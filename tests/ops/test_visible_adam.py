@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from sparsestreet.ops.adam import AdamStep, adam_step_
 from sparsestreet.ops.backend import has_triton
-from sparsestreet.ops.visible_adam import AdamStep, adam_step_
 from tests.ops.scenes import device_of, relative_error
 
 BACKENDS = ["torch"] + ["triton"] * has_triton()

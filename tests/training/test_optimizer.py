@@ -6,9 +6,8 @@ import torch
 from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.training.adam import RowAdam, VisibleAdam
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
-from sparsestreet.training.row_adam import RowAdam
-from sparsestreet.training.visible_adam import VisibleAdam
 from tests.training.stubs import background, group_of, rigid
 from tests.typed import as_a
 

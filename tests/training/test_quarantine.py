@@ -7,11 +7,11 @@ import torch
 
 from sparsestreet.on_its_way import OnItsWay
 from sparsestreet.training import quarantine
+from sparsestreet.training.adam import RefusedRows, RowAdam
 from sparsestreet.training.callbacks import Checkpoints
 from sparsestreet.training.finite import NotFiniteError
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.quarantine import FEW, SHARE, Quarantine
-from sparsestreet.training.row_adam import RefusedRows, RowAdam
 from tests.training.stubs import background, fit, frame_at, make_system, rigid
 
 MEANS = "nodes.background.rows.means"

@@ -17,10 +17,10 @@ from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes import Background
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
+from sparsestreet.training.adam import VisibleAdam
 from sparsestreet.training.losses import Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
-from sparsestreet.training.visible_adam import VisibleAdam
 from sparsestreet.types import Frame, View
 from tests.training.stubs import StubTrainer, background, fit, frame_at, group_of, make_rows, make_system, rigid
 

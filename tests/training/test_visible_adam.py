@@ -15,9 +15,8 @@ from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import StaticMaskSettings
+from sparsestreet.training.adam import RowAdam, VisibleAdam, seen_rows
 from sparsestreet.training.optimizer import OptimizerSettings
-from sparsestreet.training.row_adam import RowAdam
-from sparsestreet.training.visible_adam import VisibleAdam, seen_rows
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import camera, cast, random_gaussians
 from tests.training.stubs import background

@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import sparsestreet
 from sparsestreet.on_its_way import OnItsWay
-from sparsestreet.ops import backend, fused, triton
+from sparsestreet.ops import backend, triton
 from sparsestreet.ops.triton import launch, rasterizer, screen
 from sparsestreet.training import finite, quarantine, said_later
 
@@ -158,7 +158,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> None:
     """ "meta" counts as a CUDA device with Triton, on which nothing is launched."""
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # does not know the device
     monkeypatch.setattr(backend, "_fastest", lambda device: "triton")
-    monkeypatch.setattr(fused, "_on_gpu", lambda tensors: all(tensor.device == META for tensor in tensors))
+    monkeypatch.setattr(backend, "_on_gpu", lambda tensors: all(tensor.device == META for tensor in tensors))
     monkeypatch.setattr(rasterizer, "_check", lambda gaussians: None)
     monkeypatch.setattr(sys.modules["torch.optim.adam"], "_device_dtype_check_for_fused", lambda parameter: None)
     of_a_driver = {"launch": lambda *arguments, **constants: None, "stream_of": lambda device: 0}

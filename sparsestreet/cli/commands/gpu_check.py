@@ -141,9 +141,8 @@ def splat() -> str:
     """Draws and differentiates a small scene on the device and, in float64, on the CPU."""
     import torch
 
-    from sparsestreet.bench import gsplat_peer
-    from sparsestreet.bench.accuracy import answer, errors
-    from sparsestreet.bench.frustum import frustum_camera, frustum_gaussians
+    from sparsestreet.bench.accuracy import agrees, answer, errors
+    from sparsestreet.bench.scenes import frustum_camera, frustum_gaussians
     from sparsestreet.ops.settings import SplatSettings
 
     camera, settings = frustum_camera(SIDE, SIDE), SplatSettings()
@@ -157,7 +156,7 @@ def splat() -> str:
         ) from error
     seconds = time.perf_counter() - began
     found = errors(drawn, answer(rows, camera, settings, "reference", torch.float64))
-    if not gsplat_peer.agrees(found):
+    if not agrees(found):
         worst = max(found.gradients.values(), key=lambda one: one.relative_l2 or 0.0).relative_l2
         raise MissingError(
             f"the device draws another image than the CPU (colors differ by up to {found.image.maximum:.1e}, gradients "

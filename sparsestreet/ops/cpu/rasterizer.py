@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
-from sparsestreet.ops.cpu.workspace import FASTEST_VARIANT, Lease
+from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_values

@@ -4,22 +4,174 @@ Notation: u = mean on the screen, d = pixel center - u, Sigma = V V^T + blur I w
 Sigma^-1 = L^T L with L = [[l11, l21], [0, l22]]. A splat's alpha is o exp(-q/2) with q = |L d|^2.
 """
 
+import math
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import exact_position
-from sparsestreet.geometry.distortion import fold_radius_squared
+from sparsestreet.geometry.distortion import distort, distortion_jacobian, fold_radius_squared
 from sparsestreet.geometry.quaternions import to_matrix
-from sparsestreet.ops.reference.footprint import pinhole, unscented
-from sparsestreet.ops.reference.reasons import Reason, first_reason
-from sparsestreet.ops.reference.shutter import read_out, screen_motion
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.spherical_harmonics import view_colors
 from sparsestreet.ops.validate import check_values
-from sparsestreet.types import Camera, Gaussians
+from sparsestreet.types import Camera, Gaussians, Shutter
+
+
+class Reason(IntEnum):
+    """Reasons in the order in which the projection checks them; the first that holds counts."""
+
+    DRAWN = 0
+    MASKED = 1
+    """Opacity 0."""
+    NEAR = 2
+    """At the near plane, nearer, or behind the camera."""
+    PAST_FOLD = 3
+    """Farther off the axis than the lens polynomial describes."""
+    OUTRUNS_SHUTTER = 4
+    """Moves over the image nearly as fast as the image is read, in the same direction."""
+    VANISHED = 5
+    """Thinner than the dtype can invert, which happens only without blur."""
+    OVERFLOWED = 6
+    """Larger on the screen, or farther away, than the dtype can square."""
+    FAINT = 7
+    """Peak alpha below the cut-off."""
+    OUTSIDE = 8
+    """The box holds no pixel center of the image."""
+
+
+def first_reason(holds: dict[Reason, Bool[Tensor, " v"]]) -> Int[Tensor, " v"]:
+    """The first reason that holds for each row, DRAWN if none does; at least one reason must be given."""
+    reasons = torch.zeros_like(next(iter(holds.values())), dtype=torch.int64)
+    for reason in sorted(holds, reverse=True):
+        reasons[holds[reason]] = reason
+    return reasons
+
+
+Footprint = tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"]]
+
+
+def pinhole(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], camera: Camera) -> Footprint:
+    """Means, and V = J axes, with J at the row's mean and its slopes clamped to ``slope_limits``.
+
+    Past the limit x/z has no derivative.
+    """
+    K, inverse_z, zero = camera.intrinsics.to(in_camera), 1 / in_camera[:, 2], torch.zeros_like(in_camera[:, 2])
+    slopes = in_camera[:, :2] / in_camera[:, 2:]
+    x, y = slopes.clamp(*slope_limits(camera, in_camera)).unbind(-1)
+    row_x = torch.stack((K[0, 0] * inverse_z, zero, -K[0, 0] * x * inverse_z), -1)
+    row_y = torch.stack((zero, K[1, 1] * inverse_z, -K[1, 1] * y * inverse_z), -1)
+    return slopes * K.diagonal()[:2] + K[:2, 2], torch.stack((row_x, row_y), 1) @ axes
+
+
+def slope_limits(camera: Camera, like: Tensor) -> tuple[Float[Tensor, "2"], Float[Tensor, "2"]]:
+    """Least and largest x/z and y/z: -(cx/fx + 0.3 t) and (w - cx)/fx + 0.3 t with t = w / (2 fx), y likewise.
+
+    It is the limit 1.3 tan(fov/2) of 3DGS, moved with the principal point.
+    """
+    K, size = camera.intrinsics.to(like), like.new_tensor([camera.width, camera.height])
+    focal, center = K.diagonal()[:2], K[:2, 2]
+    margin = 0.3 * size / (2 * focal)
+    return -center / focal - margin, (size - center) / focal + margin
+
+
+def slopes_held(in_camera: Float[Tensor, "v 3"], camera: Camera) -> Bool[Tensor, " v"]:
+    """Rows whose Jacobian :func:`pinhole` takes at a limit instead of at their mean."""
+    slopes = in_camera[:, :2] / in_camera[:, 2:]
+    lowest, highest = slope_limits(camera, in_camera)
+    return ((slopes < lowest) | (slopes > highest)).any(-1)
+
+
+def unscented(
+    in_camera: Float[Tensor, "v 3"],
+    axes: Float[Tensor, "v 3 3"],
+    camera: Camera,
+    distortion: Float[Tensor, "5"],
+    near: float,
+) -> Footprint:
+    """Mean and covariance of seven sigma points sent through projection and lens.
+
+    With alpha = 1, beta = 2, kappa = 0 the points are mu and mu +- sqrt(3) a_k. mu has weight 0 in the mean and 2 in
+    the
+    covariance, the others 1/6 in both. No weight is negative, so V V^T is a covariance. The depth of a point nearer
+    than ``near`` meters is set to ``near`` and has no derivative.
+    """
+    K = camera.intrinsics.to(in_camera)
+    points = _sigma_points(in_camera, axes)
+    normalized = points[..., :2] / points[..., 2:].clamp(min=near)
+    # Relative to the principal point, because adding it would cost the differences digits.
+    pixels = distort(normalized, distortion) * K.diagonal()[:2]
+    centers = pixels[:, 1:].mean(1)
+    weights = pixels.new_tensor([2.0] + [1 / 6] * 6)
+    return centers + K[:2, 2], ((pixels - centers[:, None]) * weights.sqrt()[:, None]).mT
+
+
+def sigma_points_held(
+    in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"], distortion: Float[Tensor, "5"], near: float
+) -> Bool[Tensor, " v"]:
+    """Rows with a point that :func:`unscented` moves to ``near``, or that lies past the fold of the lens."""
+    points = _sigma_points(in_camera, axes)
+    slopes = points[..., :2] / points[..., 2:].clamp(min=near)
+    past_fold = slopes.square().sum(-1) > fold_radius_squared(distortion)
+    return (past_fold | (points[..., 2] < near)).any(-1)
+
+
+def _sigma_points(in_camera: Float[Tensor, "v 3"], axes: Float[Tensor, "v 3 3"]) -> Float[Tensor, "v 7 3"]:
+    steps = math.sqrt(3) * axes.mT
+    return in_camera[:, None] + torch.cat((torch.zeros_like(steps[:, :1]), steps, -steps), 1)
+
+
+SLOWEST_READOUT = 0.1
+"""Least a = 1 - u_y / H. A splat that moves as the readout does (a = 0) would be stretched without bound."""
+
+
+def screen_motion(
+    gaussians: Gaussians, rows: Int[Tensor, " v"], in_camera: Float[Tensor, "v 3"], camera: Camera, shutter: Shutter
+) -> Float[Tensor, "v 2"]:
+    """u, pixels per readout: the motion of the mean in the camera frame, times the exact derivative of its pixel.
+
+    It is reversed if the readout runs towards smaller coordinates.
+    """
+    rotation = shutter.rotation.to(in_camera).detach()
+    motion = -shutter.translation.to(in_camera).detach() - torch.linalg.cross(rotation[None], in_camera)
+    if gaussians.displacements is not None:
+        motion = motion + gaussians.displacements[rows].detach() @ camera.camera_from_world[:3, :3].to(in_camera).T
+    depth = in_camera[:, 2:]
+    slopes = in_camera[:, :2] / depth
+    # d(X / Z) / dt = (dX - (X / Z) dZ) / Z
+    velocity = (motion[:, :2] - slopes * motion[:, 2:]) / depth
+    if camera.distortion is not None:
+        velocity = (distortion_jacobian(slopes, camera.distortion) @ velocity[..., None])[..., 0]
+    return velocity * (shutter.sign * camera.intrinsics.to(in_camera).diagonal()[:2])
+
+
+def read_out(
+    means: Float[Tensor, "v 2"],
+    factors: Float[Tensor, "v 2 k"],
+    motion: Float[Tensor, "v 2"],
+    camera: Camera,
+    shutter: Shutter,
+) -> tuple[Footprint, Bool[Tensor, " v"]]:
+    """The splats as the readout records them, and whether each of them does not outrun it."""
+    if not shutter.reads_columns:
+        return _rows_read_out(means, factors, motion, camera.height)
+    (means, factors), read = _rows_read_out(means.flip(1), factors.flip(1), motion.flip(1), camera.width)
+    return (means.flip(1), factors.flip(1)), read
+
+
+def _rows_read_out(
+    means: Float[Tensor, "v 2"], factors: Float[Tensor, "v 2 k"], motion: Float[Tensor, "v 2"], height: int
+) -> tuple[Footprint, Bool[Tensor, " v"]]:
+    slowness = 1 - motion[:, 1] / height
+    y = (means[:, 1] - motion[:, 1] / 2) / slowness
+    x = means[:, 0] + motion[:, 0] * (y / height - 0.5)
+    factor_y = factors[:, 1] / slowness[:, None]
+    factor_x = factors[:, 0] + (motion[:, 0] / height)[:, None] * factor_y
+    return (torch.stack((x, y), -1), torch.stack((factor_x, factor_y), 1)), slowness >= SLOWEST_READOUT
+
 
 BOX_MARGIN = 0.01
 """Pixels by which boxes are widened before culling, so that rounding never decides about a touched pixel."""

@@ -1,16 +1,13 @@
 """The splat op on GPUs, in Triton. Stages of one rendering, and the files they are in:
 
-1. rows: each row to a record of 12 numbers, its radius and its number of tiles (``rows``, ``shape``, ``lens`` or
-   ``unscented``, ``shutter``, ``harmonics``, ``tiles``);
-2. lists: visible rows by depth, pairs by tile (``lists``); here the host waits once, for the number of pairs;
-3. pixels: each tile's splats into its 256 pixels (``blend``), those of long tiles in parts (``parts``, ``thin``;
-   ``programs`` says who does what), or counters of them (``count``, ``leave_one_out``);
-4. backward: pixels to a slot per pair (``blend_backward``), slots to rows (``slots``), rows to parameters
-   (``rows_backward``, and the backward halves beside each formula).
+1. rows: each row to a record of 12 numbers, its radius and its number of tiles (``project``, with ``cameras``);
+2. lists: visible rows by depth, pairs by tile (``lists``), tiles in their order and in parts (``parts``); here the host
+   waits once, for the number of pairs;
+3. pixels: each tile's splats into its 256 pixels (``blend``), or counters of them (``counters``);
+4. backward: pixels to a slot per pair, slots to rows, rows to parameters (``gradients``).
 
-``screen`` runs the first two stages, ``pixels`` the third and the first half of the fourth. ``rasterizer`` makes an
-autograd function of them. ``tuning`` holds what only a device can decide. ``quaternions`` and ``vectors`` serve all
-formulas.
+``view`` holds the camera and the layout of records. ``screen`` runs the first two stages, ``pixels`` the third and the
+first half of the fourth. ``rasterizer`` makes an autograd function of them. ``quaternions`` serve all formulas.
 
 Other parts of a training step have a file each: ``poses`` and ``activate`` before the op, ``sky`` and ``ssim`` after
 it, and ``adam``.

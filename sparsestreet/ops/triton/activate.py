@@ -17,18 +17,22 @@ from torch.autograd.function import once_differentiable
 from triton.runtime.jit import KernelInterface
 
 from sparsestreet.ops.raw import INPUTS, RawGaussians
-from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.launch import constant, jit, launch
 from sparsestreet.ops.triton.quaternions import (
     conjugate,
+    load_row,
     multiply,
+    plus,
     rotation_backward,
     rotation_of,
+    scaled,
+    store_row,
+    times,
+    transposed_times,
     unit_backward,
     unit_quaternion,
     weighted,
 )
-from sparsestreet.ops.triton.vectors import load_row, plus, scaled, store_row, times, transposed_times
 from sparsestreet.types import Gaussians
 
 LANES = 128

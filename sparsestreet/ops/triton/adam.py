@@ -8,8 +8,7 @@ import triton.language as tl
 from torch import Tensor, uint8
 from torch.autograd.graph import increment_version
 
-from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.launch import jit, launch
 
 # One number per lane: whether a lane loads differs between neighbors, so that wider loads would not be merged.
 LANES = 256

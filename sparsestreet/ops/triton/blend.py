@@ -9,32 +9,292 @@ from functools import partial
 
 import triton.language as tl
 
-from sparsestreet.ops.triton import records as record
-from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.programs import place_of, work_of
-from sparsestreet.ops.triton.quadrants import (
-    WARP,
-    across,
-    centers,
-    held_splat,
-    hold_splats,
-    load_splat,
-    of_lines,
-    part_places,
-    quadrant_places,
-    row_of,
-    touches,
-)
-from sparsestreet.ops.triton.thin import LOOK, alpha_of, open_light, thin_pairs
-from sparsestreet.ops.triton.view import TILE
+from sparsestreet.ops.triton import view as record
+from sparsestreet.ops.triton.launch import constant, jit
+from sparsestreet.ops.triton.view import TILE, lines_span
+
+
+@jit
+def place_of(ahead, part_count, TOGETHER: tl.constexpr):
+    """Place of this program's tile in the order, and whether and which part it has instead.
+
+    ``ahead[0]``: number of tiles that start before the parts. Volatile, so that the compiler computes all this anew
+    after a loop instead of keeping it in registers."""
+    place = tl.program_id(0)
+    part = place
+    is_part = place >= 0
+    if TOGETHER:
+        part = place - tl.load(ahead, volatile=True)
+        is_part = (part >= 0) & (part < part_count)
+        place = tl.where(is_part, 0, tl.where(part < 0, place, place - part_count))
+        part = tl.where(is_part, part, 0)
+    return place, part, is_part
+
+
+@jit
+def work_of(
+    begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count,
+    REST: tl.constexpr, TOGETHER: tl.constexpr,
+):  # fmt: skip
+    """Tile, number of the part, first pair, the one after the last, and whether it is a part.
+
+    REST: parts alone; TOGETHER: whole tiles and parts; else whole tiles alone."""
+    place, part, is_part = place_of(ahead, part_count, TOGETHER)
+    if TOGETHER:
+        tile = tl.where(is_part, tl.load(part_tiles + part), tl.load(order + place))
+        begin = tl.where(is_part, tl.load(part_begins + part), tl.load(begins + tile))
+        end = tl.where(is_part, tl.load(part_ends + part), tl.load(ends + tile))
+    elif REST:
+        tile, begin, end = tl.load(part_tiles + part), tl.load(part_begins + part), tl.load(part_ends + part)
+    else:
+        tile = tl.load(order + place)
+        begin, end = tl.load(begins + tile), tl.load(ends + tile)
+    return tile, part, begin, end, is_part
+
+
+SIDE = constant(8)
+QUADRANT_PIXELS = 64
+QUADRANT_SIZE = constant(QUADRANT_PIXELS)
+WARP = constant(32)
+QUADRANT_SHIFT = 28
+MOST_ROWS = 1 << QUADRANT_SHIFT
+"""Most rows: a pair stores its row and its quadrants in 32 bits."""
+ROW = constant(MOST_ROWS - 1)
+SHIFT = constant(QUADRANT_SHIFT)
+ALL = constant(15)
+
+
+@jit
+def row_of(pair):
+    """The row of a pair."""
+    return pair & ROW
+
+
+@jit
+def touches(pair, QUADRANT: tl.constexpr):
+    """Whether the pair's splat can touch a quadrant."""
+    return ((pair >> (SHIFT + QUADRANT)) & 1) != 0
+
+
+@jit
+def half_spans(splat, reach, tile_y, BOUNDED: tl.constexpr):
+    """Least and largest x of the ellipse (tiles.py) in the upper and lower half of a row of tiles.
+
+    Also whether it reaches each half. Empty if nothing bounds the splat."""
+    spans = ()
+    if BOUNDED:
+        x, y, l11, l21, l22 = splat
+        for half in tl.static_range(2):
+            spans += (lines_span(x, y, l11, l21, l22, reach, tile_y * TILE + half * SIDE, SIDE),)
+    return spans
+
+
+@jit
+def touched_quadrants(spans, tile_x, BOUNDED: tl.constexpr):
+    """Bits of the quadrants of a tile that hold a pixel center of the ellipse, as a pair carries them."""
+    bits = tl.zeros_like(tile_x) + ALL
+    if BOUNDED:
+        bits = tl.zeros_like(tile_x)
+        middle = (tile_x * TILE + SIDE).to(tl.float32)
+        for half in tl.static_range(2):
+            low, high, reached = spans[half]
+            left = reached & (low <= middle - 0.5) & (high >= middle - (SIDE - 0.5))
+            right = reached & (high >= middle + 0.5) & (low <= middle + (SIDE - 0.5))
+            bits = bits | (left.to(tl.int32) << (2 * half)) | (right.to(tl.int32) << (2 * half + 1))
+    return bits << SHIFT
+
+
+@jit
+def quadrant_pixels(tile, tiles_x, QUADRANT: tl.constexpr):
+    """Columns and lines of a quadrant's pixels [64]. Each lane gets one of 32 neighbors, so its two are four apart."""
+    p = tl.arange(0, QUADRANT_SIZE)
+    x = (tile % tiles_x) * TILE + QUADRANT % 2 * SIDE + p // WARP * 4 + p % WARP // SIDE
+    y = (tile // tiles_x) * TILE + QUADRANT // 2 * SIDE + p % SIDE
+    return x, y
+
+
+@jit
+def quadrant_places(tile, width, height, tiles_x, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the image, and which of them lie in it; [64]."""
+    x, y = quadrant_pixels(tile, tiles_x, QUADRANT)
+    return y * width + x, (x < width) & (y < height)
+
+
+@jit
+def part_places(part, QUADRANT: tl.constexpr):
+    """Indices of a quadrant's pixels in the layers of parts [64], of all, because those outside the image are read."""
+    x, y = quadrant_pixels(0, 1, QUADRANT)
+    return part * TILE * TILE + y * TILE + x
+
+
+@jit
+def centers(tile, tiles_x):
+    """Centers of the upper left quadrant's pixels. For other quadrants kernels move the splat by SIDE."""
+    x, y = quadrant_pixels(tile, tiles_x, 0)
+    return x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
+
+
+@jit
+def lane_sum(values):
+    """Sums over the two pixels of each lane [32]."""
+    return tl.sum(tl.reshape(values, (QUADRANT_SIZE // WARP, WARP)), 0)
+
+
+@jit
+def of_lane(values):
+    """Values that the two pixels of each lane share [32]."""
+    return tl.max(tl.reshape(values, (QUADRANT_SIZE // WARP, WARP)), 0)
+
+
+@jit
+def load_shape(records, row, GATED: tl.constexpr):
+    """Mean and factor of the row's splat; log2 of its opacity, the cutoff, and its gate where rows have gates."""
+    s = record.record_of(records, row)
+    geometry = (
+        tl.load(s + record.X), tl.load(s + record.Y),
+        tl.load(s + record.L11), tl.load(s + record.L21), tl.load(s + record.L22),
+    )  # fmt: skip
+    ends = (tl.load(s + record.LOG2_OPACITY), tl.load(s + record.CUTOFF))
+    if GATED:
+        ends += (tl.load(s + record.GATE),)
+    return geometry, ends
+
+
+@jit
+def load_splat(records, row, GATED: tl.constexpr):
+    """The shape of the row's splat (``load_shape``), its color and depth."""
+    geometry, ends = load_shape(records, row, GATED)
+    s = record.record_of(records, row)
+    return geometry, ends, (
+        tl.load(s + record.COLOR), tl.load(s + record.COLOR + 1), tl.load(s + record.COLOR + 2),
+        tl.load(s + record.DEPTH),
+    )  # fmt: skip
+
+
+@jit
+def hold_splats(records, pair_rows, k, end, GATED: tl.constexpr):
+    """Of WARP pairs from ``k`` on one splat in each lane: the numbers of ``load_splat`` and whatever behind ``end``."""
+    pair = k + tl.arange(0, WARP)
+    given = pair < end
+    s = record.record_of(records, row_of(tl.load(pair_rows + pair, given, 0)))
+    held = (
+        tl.load(s + record.X, given, 0.0), tl.load(s + record.Y, given, 0.0),
+        tl.load(s + record.L11, given, 0.0), tl.load(s + record.L21, given, 0.0), tl.load(s + record.L22, given, 0.0),
+        tl.load(s + record.LOG2_OPACITY, given, 0.0), tl.load(s + record.CUTOFF, given, 0.0),
+        tl.load(s + record.COLOR, given, 0.0), tl.load(s + record.COLOR + 1, given, 0.0),
+        tl.load(s + record.COLOR + 2, given, 0.0), tl.load(s + record.DEPTH, given, 0.0),
+    )  # fmt: skip
+    if GATED:
+        held += (tl.load(s + record.GATE, given, 0.0),)
+    return held
+
+
+@jit
+def handed(values, lane):
+    """The value of one lane, to all pixels of a quadrant [64]."""
+    value = tl.gather(values, tl.zeros((WARP,), tl.int32) + lane, 0)
+    return tl.reshape(tl.broadcast_to(value[None, :], (QUADRANT_SIZE // WARP, WARP)), (QUADRANT_SIZE,))
+
+
+@jit
+def held_splat(held, lane, GATED: tl.constexpr):
+    """As ``load_splat``, of the splat that a lane holds."""
+    x, y, l11, l21, l22, log2_opacity, cutoff, red, green, blue, depth = held[:11]
+    geometry = (handed(x, lane), handed(y, lane), handed(l11, lane), handed(l21, lane), handed(l22, lane))
+    color = (handed(red, lane), handed(green, lane), handed(blue, lane), handed(depth, lane))
+    ends = (handed(log2_opacity, lane), handed(cutoff, lane))
+    if GATED:
+        ends += (handed(held[11], lane),)
+    return geometry, ends, color
+
+
+@jit
+def of_lines(y, geometry, log2_opacity, LOWER: tl.constexpr):
+    """What the pixels of a line share: dy, its part of (L d)_1, (L d)_2, and the exponent without (L d)_1.
+
+    LOWER: for the lower quadrants.
+    """
+    dy = y - (geometry[1] - LOWER * SIDE)
+    b = geometry[4] * dy
+    return dy, geometry[3] * dy, b, log2_opacity - b * b
+
+
+@jit
+def across(x, geometry, line, RIGHT: tl.constexpr):
+    """dx and (L d)_1 of a quadrant's pixels; RIGHT: for a right quadrant."""
+    dx = x - (geometry[0] - RIGHT * SIDE)
+    return dx, geometry[2] * dx + line[1]
+
+
+# Number of pairs between two checks whether the whole tile is finished.
+LOOK_LENGTH = 32
+LOOK = constant(LOOK_LENGTH)
+
+
+@jit
+def open_light(tile, width, height, tiles_x, QUADRANT: tl.constexpr):
+    """Light before the first splat: none outside the image."""
+    _, inside = quadrant_places(tile, width, height, tiles_x, QUADRANT)
+    return tl.where(inside, 1.0, 0.0)
+
+
+@jit
+def alpha_of(exponent, ends, alpha_max):
+    """Alpha after the clamp, times the gate where rows have gates (``load_shape``)."""
+    alpha = tl.minimum(tl.exp2(exponent), alpha_max)
+    return alpha * ends[2] if len(ends) > 2 else alpha
+
+
+@jit
+def thin_quadrant(touched, passed, x, line, RIGHT: tl.constexpr, shape, alpha_max):
+    """A quadrant's light after a splat, which may touch it; rounded as in the blend."""
+    if touched:
+        geometry, ends = shape
+        _, a = across(x, geometry, line, RIGHT)
+        exponent = line[3] - a * a
+        alpha = alpha_of(exponent, ends, alpha_max)
+        passed -= tl.where(exponent >= ends[1], alpha, 0.0) * passed
+    return passed
+
+
+@jit
+def thin_pairs(
+    records, pair_rows, k, end, tile, part, products, width, height, tiles_x, alpha_max, transmittance_min,
+    GATED: tl.constexpr,
+):  # fmt: skip
+    """Writes the product of 1 - alpha over the pairs of a part, or some value below the limit once it is below."""
+    t0, t1 = open_light(tile, width, height, tiles_x, 0), open_light(tile, width, height, tiles_x, 1)
+    t2, t3 = open_light(tile, width, height, tiles_x, 2), open_light(tile, width, height, tiles_x, 3)
+    x, y = centers(tile, tiles_x)
+    unfinished = k < end
+    pair = tl.load(pair_rows + k, unfinished, 0)
+    while unfinished:
+        stop = tl.minimum(k + LOOK, end)
+        for i in range(k, stop):
+            shape, touched = load_shape(records, row_of(pair), GATED), pair
+            pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
+            line = of_lines(y, shape[0], shape[1][0], 0)
+            t0 = thin_quadrant(touches(touched, 0), t0, x, line, 0, shape, alpha_max)
+            t1 = thin_quadrant(touches(touched, 1), t1, x, line, 1, shape, alpha_max)
+            line = of_lines(y, shape[0], shape[1][0], 1)
+            t2 = thin_quadrant(touches(touched, 2), t2, x, line, 0, shape, alpha_max)
+            t3 = thin_quadrant(touches(touched, 3), t3, x, line, 1, shape, alpha_max)
+        k = stop
+        most = tl.maximum(tl.maximum(t0, t1), tl.maximum(t2, t3))
+        unfinished = (k < end) & (tl.max(most) > transmittance_min)
+    tl.store(products + part_places(part, 0), t0)
+    tl.store(products + part_places(part, 1), t1)
+    tl.store(products + part_places(part, 2), t2)
+    tl.store(products + part_places(part, 3), t3)
+
 
 PIXEL_COUNT = 256
 PIXELS = constant(PIXEL_COUNT)
 
 
-def registers(exclusive: bool, staged: bool, gated: bool) -> int:
-    """Fewest registers of a lane without spills. A multiprocessor runs 24 warps with 80 registers, 20 with up to 96."""
-    return 96 + 8 * gated if staged else 88 if exclusive else 80
+def registers(gated: bool) -> int:
+    """Return the fewest registers of a lane without spills. A multiprocessor runs 20 warps with up to 96."""
+    return 96 + 8 * gated
 
 
 @jit
@@ -167,21 +427,20 @@ def blend_tiles(
     rgb, transmittance, depth_sum, lasts, part_rgb, part_transmittance, part_depth, part_lasts,
     width, height, tiles_x, part_count, alpha_max, transmittance_min,
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
-    PARTS: tl.constexpr, TOGETHER: tl.constexpr, REST: tl.constexpr, STAGED: tl.constexpr, GATED: tl.constexpr,
-    BLOCK: tl.constexpr,
+    TOGETHER: tl.constexpr, REST: tl.constexpr, GATED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes every pixel of one tile; with PARTS those of one part, if needed, into the layers of parts (parts.py).
+    """Writes every pixel of one tile, and those of a part, if needed, into the layers of parts (parts.py).
 
     ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins. TOGETHER:
     whole tiles and parts. Of parts the first ones of tiles are then blended, and of the others it is computed what they
-    let through. REST: parts but the first ones. STAGED: each lane fetches the record of one of the next pairs. GATED:
-    a row's gate multiplies its alpha.
+    let through. REST: parts but the first ones. GATED: a row's gate multiplies its alpha. Each lane fetches the record
+    of one of the next pairs, because a warp then waits for memory once in LOOK pairs.
     """
     tl.static_assert(BLOCK == 1)
     tables = (begins, ends, order, ahead, part_tiles, part_begins, part_ends, part_count)
-    tile, part, k, end, is_part = work_of(*tables, PARTS, TOGETHER)
+    tile, part, k, end, is_part = work_of(*tables, REST, TOGETHER)
     limit, first = transmittance_min, part
-    if PARTS or TOGETHER:
+    if REST or TOGETHER:
         first = tl.load(firsts + part)
     if TOGETHER:
         later = is_part & (first < part)
@@ -203,11 +462,10 @@ def blend_tiles(
     pair = tl.load(pair_rows + k, written, 0)
     while unfinished:
         stop = tl.minimum(k + LOOK, end)
-        if STAGED:
-            held = hold_splats(records, pair_rows, k, end, GATED)
+        held = hold_splats(records, pair_rows, k, end, GATED)
         for i in range(k, stop):
             touched = pair
-            splat = held_splat(held, i - k, GATED) if STAGED else load_splat(records, row_of(pair), GATED)
+            splat = held_splat(held, i - k, GATED)
             pair = tl.load(pair_rows + i + 1, i + 1 < end, 0)
             more = (splat, i, alpha_max, limit, EXCLUSIVE, DEPTH, LASTS)
             line = of_lines(y, splat[0], splat[1][0], 0)
@@ -220,10 +478,10 @@ def blend_tiles(
         unfinished = (k < end) & any_open(q0, q1, q2, q3, limit)
     quadrants = (q0, q1, q2, q3)
     place, part, is_part = place_of(ahead, part_count, TOGETHER)
-    if PARTS or TOGETHER:
+    if REST or TOGETHER:
         layers = (part_rgb, part_transmittance, part_depth, part_lasts)
         store_in_part(written & is_part, quadrants, layers, part, products, DEPTH, LASTS, TOGETHER)
-    if not PARTS:
+    if not REST:
         layers, is_whole = (rgb, transmittance, depth_sum, lasts), place >= 0
         if TOGETHER:
             is_whole = not is_part

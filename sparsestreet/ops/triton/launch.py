@@ -5,7 +5,9 @@ result.
 This takes the host longer than many kernels take the device. Here a repeated launch calls the compiled kernel directly.
 """
 
+import inspect
 import warnings
+from collections.abc import Callable
 from functools import cache, reduce
 from operator import attrgetter, or_
 from typing import Any
@@ -13,11 +15,57 @@ from typing import Any
 import numpy as np
 import torch
 import triton
+import triton.language as tl
 from torch import Tensor
 from triton.compiler import CompiledKernel
 from triton.runtime import driver
 from triton.runtime.interpreter import InterpretedFunction
 from triton.runtime.jit import KernelInterface
+
+_INTERPRETED = triton.knobs.runtime.interpret
+
+
+def jit(function: Callable, **options: Any) -> KernelInterface:
+    """Applies triton.jit to the bare function, because a type checker wrapped around it would hide its globals.
+
+    Counts that change between renderings belong in ``do_not_specialize``. Otherwise the compiler makes one kernel for
+    multiples of 16, one for 1 and one for the rest.
+    """
+    return triton.jit(inspect.unwrap(function), **options)
+
+
+def constant(value: int | float | tuple[float, ...]) -> int | float | tuple[float, ...] | tl.constexpr:
+    """A global number (or tuple of numbers) for kernels, wrapped as the compiler wants it.
+
+    Triton's interpreter gets the bare number. There a wrapped number times a tensor would be wrapped again, which no
+    function takes.
+    """
+    return value if _INTERPRETED else tl.constexpr(value)
+
+
+_ALIGNED = 4
+"""Numbers of 4 bytes in the 16 that kernels are compiled to expect the beginning of a vector at."""
+
+
+def vectors(like: Tensor, *lengths: int, dtype: torch.dtype = torch.int32) -> tuple[Tensor, ...]:
+    """Unwritten vectors of these lengths, of 4 bytes a number, on the device of ``like``.
+
+    They are freed together, so they should be needed equally long.
+
+    >>> [len(vector) for vector in vectors(torch.zeros(1), 3, 8)]
+    [3, 8]
+    """
+    if not reduce(or_, lengths) % _ALIGNED:
+        return like.new_empty(sum(lengths), dtype=dtype).split_with_sizes(lengths)
+    pieces, places = [], []
+    for length in lengths:
+        places.append(len(pieces))
+        pieces.append(length)
+        if length % _ALIGNED:
+            pieces.append(_ALIGNED - length % _ALIGNED)
+    found = like.new_empty(sum(pieces), dtype=dtype).split_with_sizes(pieces)
+    return tuple(found[place] for place in places)
+
 
 _KNOWN = ("3.6.", "3.7.")
 """Versions of Triton for which a direct call is known to work.

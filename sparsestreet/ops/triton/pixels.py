@@ -1,24 +1,179 @@
 """Runs the pixel kernels of a view: over whole tiles and, if there may be long ones, over parts (parts.py)."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
-from jaxtyping import Float, Int, UInt8
+import triton.language as tl
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.ops.triton import blend, blend_backward
-from sparsestreet.ops.triton.compose import Split, compose
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.raster import LEAST_ALPHA
+from sparsestreet.ops.triton import blend, gradients
+from sparsestreet.ops.triton.blend import PIXELS
+from sparsestreet.ops.triton.launch import constant, jit, launch
 from sparsestreet.ops.triton.lists import Lists
-from sparsestreet.ops.triton.parts import PartLayers, Parts, thin_parts
+from sparsestreet.ops.triton.parts import PartLayers, Parts, merged
 from sparsestreet.ops.triton.screen import Screen, given_or
-from sparsestreet.ops.triton.tuning import tuning
-from sparsestreet.ops.triton.view import KernelView
+from sparsestreet.ops.triton.view import TILE, TILE_SIZE, KernelView
+
+_BLOCK = 512
+_OPTIONS = {"enable_fp_fusion": False}
+LEAST = constant(LEAST_ALPHA)
+
+
+@dataclass(frozen=True)
+class Composed:
+    """What backward needs of a composed image."""
+
+    transmittance: Float[Tensor, "h w"]
+    depth: Float[Tensor, "h w"]
+    background: Float[Tensor, "..."] | None
+    """[3] or [h, w, 3]."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """Tiles whose pixels are still in parts."""
+
+    parts: Parts
+    layers: PartLayers
+    limit: float
+    """Light at which a pixel is finished."""
+
+
+def compose(
+    rgb: Float[Tensor, "h w 3"],
+    transmittance: Float[Tensor, "h w"],
+    depth_sum: Float[Tensor, "h w"],
+    background: Float[Tensor, "..."] | None,
+    lasts: Int[Tensor, "h w"] | None = None,
+    split: Split | None = None,
+) -> Float[Tensor, "h w"]:
+    """Returns alpha; puts the background behind ``rgb`` and turns ``depth_sum`` into a depth, both in place.
+
+    The pixels of ``split`` tiles it first adds up from their parts, with where they end if ``lasts`` are given."""
+    alpha, (height, width) = transmittance.new_empty(transmittance.shape), transmittance.shape
+    columns = -(-width // TILE_SIZE)
+    tables, limit = (rgb,) * 7, 0.0
+    if split is not None:
+        part, limit = split.layers, split.limit
+        tables = (
+            split.parts.of_tiles, split.parts.nexts,
+            part.products, part.rgb, part.transmittance, part.depth_sum, part.lasts,
+        )  # fmt: skip
+    launch(
+        compose_pixels, columns * -(-height // TILE_SIZE), 1,
+        rgb, transmittance, depth_sum, rgb if lasts is None else lasts, rgb if background is None else background,
+        alpha, *tables, width, height, columns, limit,
+        PARTS=split is not None, LASTS=split is not None and lasts is not None, **_behind(background), options=_OPTIONS,
+    )  # fmt: skip
+    return alpha
+
+
+def decompose(
+    composed: Composed, v_rgb: Tensor, v_alpha: Tensor | None, v_depth: Tensor | None, background_too: bool
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    """Gradients of the transmittance, of the sum of depths (None: none was asked for), and of the background."""
+    passed, background = composed.transmittance, composed.background
+    if v_alpha is None and v_depth is None and background is None:
+        return torch.zeros_like(passed), None, None
+    v_passed, v_background = torch.empty_like(passed), torch.empty_like(v_rgb) if background_too else None
+    v_depth_sum = None if v_depth is None else torch.empty_like(passed)
+    unread = [passed if given is None else given for given in (v_alpha, v_depth, background, v_background, v_depth_sum)]
+    launch(
+        decompose_pixels, passed.numel(), _BLOCK,
+        passed, composed.depth, v_rgb, *unread, v_passed, passed.numel(),
+        ALPHA=v_alpha is not None, DEPTH=v_depth is not None, COLORS=background_too, **_behind(background),
+        options=_OPTIONS,
+    )  # fmt: skip
+    if v_background is not None and background is not None and background.dim() == 1:
+        v_background = v_background.sum((0, 1))
+    return v_passed, v_depth_sum, v_background
+
+
+def _behind(background: Tensor | None) -> dict[str, int]:
+    """How far the colors of two pixels lie apart; -1: there is no background."""
+    return {"APART": -1 if background is None else 3 * (background.dim() == 3)}
+
+
+@jit
+def compose_pixels(
+    rgb, transmittance, depth_sum, lasts, background, alpha,
+    of_tiles, nexts, products, part_rgb, part_transmittance, part_depth, part_lasts,
+    width, height, tiles_x, limit,
+    PARTS: tl.constexpr, LASTS: tl.constexpr, APART: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """The pixels of one tile, line by line."""
+    tl.static_assert(BLOCK == 1)
+    tile, p = tl.program_id(0), tl.arange(0, PIXELS)
+    x, y = tile % tiles_x * TILE + p % TILE, tile // tiles_x * TILE + p // TILE
+    inside, at = (x < width) & (y < height), y * width + x
+    first = tile
+    whole, split = inside, inside
+    if PARTS:
+        first = tl.load(of_tiles + tile)
+        whole, split = inside & (first < 0), inside & (first >= 0)
+    passed, depth = tl.load(transmittance + at, whole, 1.0), tl.load(depth_sum + at, whole, 0.0)
+    red, green, blue = tl.zeros_like(passed), tl.zeros_like(passed), tl.zeros_like(passed)
+    if PARTS or APART >= 0:
+        to = rgb + 3 * at
+        red, green, blue = tl.load(to, whole, 0.0), tl.load(to + 1, whole, 0.0), tl.load(to + 2, whole, 0.0)
+    if PARTS:
+        layers = (products, part_rgb, part_transmittance, part_depth, part_lasts)
+        pixel = (passed, red, green, blue, depth, p)
+        passed, red, green, blue, depth, last = merged(first, p, pixel, nexts, *layers, limit, LASTS)
+        tl.store(transmittance + at, passed, split)
+        if LASTS:
+            tl.store(lasts + at, last, split)
+    opaque = 1 - passed
+    tl.store(alpha + at, opaque, inside)
+    tl.store(depth_sum + at, tl.div_rn(depth, tl.maximum(opaque, LEAST)), inside)
+    if APART >= 0:
+        behind = background + APART * at
+        red += passed * tl.load(behind, inside, 0.0)
+        green += passed * tl.load(behind + 1, inside, 0.0)
+        blue += passed * tl.load(behind + 2, inside, 0.0)
+        split = inside
+    if PARTS or APART >= 0:
+        tl.store(to, red, split)
+        tl.store(to + 1, green, split)
+        tl.store(to + 2, blue, split)
+
+
+@partial(jit, do_not_specialize=["pixels"])
+def decompose_pixels(
+    transmittance, depths, v_rgb, v_alphas, v_depths, background, v_background, v_depth_sum, v_transmittance, pixels,
+    ALPHA: tl.constexpr, DEPTH: tl.constexpr, COLORS: tl.constexpr, APART: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """In the order in which torch adds and divides."""
+    pixel = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    given = pixel < pixels
+    passed = tl.load(transmittance + pixel, given, 1.0)
+    opaque, v_opaque = 1 - passed, tl.zeros_like(passed)
+    if ALPHA:
+        v_opaque = tl.load(v_alphas + pixel, given, 0.0)
+    if DEPTH:
+        v_depth, least = tl.load(v_depths + pixel, given, 0.0), tl.maximum(opaque, LEAST)
+        tl.store(v_depth_sum + pixel, tl.div_rn(v_depth, least), given)
+        through = -v_depth * tl.div_rn(tl.load(depths + pixel, given, 0.0), least)
+        v_opaque += tl.where(opaque >= LEAST, through, 0.0)
+    v_passed = -v_opaque
+    if APART >= 0:
+        through = tl.zeros_like(passed)
+        for i in tl.static_range(3):
+            color = tl.load(v_rgb + 3 * pixel + i, given, 0.0)
+            through += color * tl.load(background + APART * pixel + i, given, 0.0)
+            if COLORS:
+                tl.store(v_background + 3 * pixel + i, color * passed, given)
+        v_passed += through
+    tl.store(v_transmittance + pixel, v_passed, given)
+
 
 ONE_WARP = {"num_warps": 1}
-WHOLE_TILES = {"PARTS": False, "TOGETHER": False}
-PARTS = {"PARTS": True, "TOGETHER": False}
-TOGETHER = {"PARTS": False, "TOGETHER": True}
+WHOLE_TILES = {"REST": False, "TOGETHER": False}
+TOGETHER = {"REST": False, "TOGETHER": True}
+REST = {"REST": True, "TOGETHER": False}
 
 
 @dataclass(frozen=True)
@@ -63,66 +218,48 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
         neighbors, split = (parts.firsts, parts.nexts, part.products), Split(parts, part, limit)
     tables = (screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers)
     numbers = (*sizes(view, parts), view.settings.alpha_max, limit)
-    tiles, part_count, choices = lists.order.shape[0], numbers[3], tuning()
-    options = ONE_WARP | {"maxnreg": blend.registers(view.exclusive, choices.staged, screen.gated)}
+    tiles, part_count = lists.order.shape[0], numbers[3]
+    options = ONE_WARP | {"maxnreg": blend.registers(screen.gated)}
 
-    def blend_each(count: int, work: dict[str, bool], rest: bool = False) -> None:
+    def blend_each(count: int, work: dict[str, bool]) -> None:
         launch(
             blend.blend_tiles, count, 1, *tables, *numbers,
-            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, REST=rest, STAGED=choices.staged, GATED=screen.gated,
-            **work, options=options,
+            EXCLUSIVE=view.exclusive, DEPTH=True, LASTS=lasts, GATED=screen.gated, **work, options=options,
         )  # fmt: skip
 
     if parts is None or part is None:
         blend_each(tiles, WHOLE_TILES)
-    elif choices.two_launches:
-        blend_each(tiles + part_count, TOGETHER)
-        blend_each(part_count, PARTS, rest=True)
     else:
-        blend_each(tiles, WHOLE_TILES)
-        launch(
-            thin_parts, part_count, 1,
-            screen.records, lists.pair_rows, parts.tiles, parts.begins, parts.ends, parts.nexts, part.products,
-            *pixel_arguments(view), limit, GATED=screen.gated, options=ONE_WARP,
-        )  # fmt: skip
-        blend_each(part_count, PARTS)
+        # Whole tiles, first parts and what later ones let through; then these. In a launch of its own, each would wait
+        # for the one before.
+        blend_each(tiles + part_count, TOGETHER)
+        blend_each(part_count, REST)
     alpha = compose(rgb, transmittance, depth_sum, background, last, split)
     return Layers(rgb, alpha, depth_sum, Ends(transmittance, last, part))
 
 
 def differentiate_view(
     screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
-) -> tuple[Float[Tensor, "p s"], UInt8[Tensor, " p"] | None]:
-    """A slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means.
-
-    Also which slots are written, as bytes; None: all."""
+) -> Float[Tensor, "p s"]:
+    """Return a slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means."""
     lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
-    slots = passed.new_empty(lists.sizes.pairs, blend_backward.slot_length(screen.gated))
-    walked = slots.new_zeros(len(slots), dtype=torch.uint8) if tuning().marked_slots else None
+    slots = passed.new_empty(lists.sizes.pairs, gradients.slot_length(screen.gated))
     parts, part = lists.parts, ends.parts
+    part_count = 0 if parts is None else len(parts)
     nexts, part_layers = lists.order, (passed, passed, passed, lists.order)
     if parts is not None and part is not None:
         nexts, part_layers = parts.nexts, (part.rgb, part.depth_sum, part.transmittance, part.lasts)
 
-    def differentiate_each(count: int, work: dict[str, bool]) -> None:
-        launch(
-            blend_backward.blend_tiles_backward, count, 1,
-            screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
-            v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots, given_or(walked, lists.order),
-            *sizes(view, parts), view.settings.alpha_max,
-            DEPTH=depth, ABSOLUTE=absolute, MARKED=walked is not None, GATED=screen.gated, **work,
-            options=ONE_WARP | {"maxnreg": blend_backward.registers(depth, screen.gated)},
-        )  # fmt: skip
+    launch(
+        gradients.blend_tiles_backward, len(lists.order) + part_count, 1,
+        screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
+        v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots,
+        *sizes(view, parts), view.settings.alpha_max,
+        DEPTH=depth, ABSOLUTE=absolute, GATED=screen.gated, TOGETHER=parts is not None,
+        options=ONE_WARP | {"maxnreg": gradients.registers(depth, screen.gated)},
+    )  # fmt: skip
 
-    tiles = len(lists.order)
-    if parts is None:
-        differentiate_each(tiles, WHOLE_TILES)
-    elif tuning().two_launches:
-        differentiate_each(tiles + len(parts), TOGETHER)
-    else:
-        differentiate_each(tiles, WHOLE_TILES)
-        differentiate_each(len(parts), PARTS)
-    return slots, walked
+    return slots
 
 
 def work_tables(lists: Lists) -> tuple[Tensor, ...]:

@@ -12,17 +12,20 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sparsestreet.geometry.trajectories import TIME_TOLERANCE, Trajectories
-from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.launch import constant, jit, launch
 from sparsestreet.ops.triton.quaternions import (
     conjugate,
+    dot,
     inner,
+    load_row,
     multiply,
+    plus,
+    scaled,
+    store_row,
     unit_backward,
     unit_quaternion,
     weighted,
 )
-from sparsestreet.ops.triton.vectors import dot, load_row, plus, scaled, store_row
 
 LANES = 32
 OPTIONS = {"num_warps": 1}

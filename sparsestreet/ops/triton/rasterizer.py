@@ -11,20 +11,22 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.triton import blend, blend_backward, count, rows_backward, slots
-from sparsestreet.ops.triton import leave_one_out as remove
-from sparsestreet.ops.triton.compose import Composed, decompose
+from sparsestreet.ops.triton import blend
+from sparsestreet.ops.triton.blend import MOST_ROWS
+from sparsestreet.ops.triton.counters import CHANGE_COUNT, COUNTER_COUNT, count_tiles_pixels, remove_from_tiles
+from sparsestreet.ops.triton.gradients import GATE_PLACE, OPTIONS, ROWS, block_of, project_rows_backward, sum_slots
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
 from sparsestreet.ops.triton.pixels import (
     ONE_WARP,
+    Composed,
     Cotangents,
     Ends,
     blend_view,
+    decompose,
     differentiate_view,
     pixel_arguments,
 )
-from sparsestreet.ops.triton.quadrants import MOST_ROWS
 from sparsestreet.ops.triton.screen import Screen, contiguous, draw, effects, fields_of, given_or, project
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
@@ -56,13 +58,13 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
     view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     lists = screen.lists
-    counters = screen.records.new_empty(len(lists.slots), count.COUNTER_COUNT)
+    counters = screen.records.new_empty(len(lists.slots), COUNTER_COUNT)
     launch(
-        count.count_tiles_pixels, len(lists.order), 1,
+        count_tiles_pixels, len(lists.order), 1,
         screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, lists.order, counters,
         *pixel_arguments(view), view.transmittance_min, EXCLUSIVE=view.exclusive, options=ONE_WARP,
     )  # fmt: skip
-    totals = torch.zeros(len(gaussians), count.COUNTER_COUNT, dtype=torch.float64, device=counters.device)
+    totals = torch.zeros(len(gaussians), COUNTER_COUNT, dtype=torch.float64, device=counters.device)
     _sum_slots(counters, lists, totals, 4, tl.float64)
     weight, pixels, dominant = totals.unbind(-1)
     return Contribution(weight, pixels.long(), dominant.long())
@@ -81,16 +83,16 @@ def leave_one_out(
     view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     lists, layers = screen.lists, blend_view(screen, view, lasts=True)
-    changes = screen.records.new_empty(len(lists.slots), remove.CHANGE_COUNT)
+    changes = screen.records.new_empty(len(lists.slots), CHANGE_COUNT)
     behind, counts = contiguous(background), contiguous(pixel_weights)
     passed = layers.ends.transmittance
     launch(
-        remove.remove_from_tiles, len(lists.order), 1,
+        remove_from_tiles, len(lists.order), 1,
         screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, layers.ends.lasts, lists.order,
         passed, given_or(behind, passed), given_or(counts, passed), changes, *pixel_arguments(view),
         BEHIND=behind is not None, WEIGHTED=counts is not None, options=ONE_WARP,
     )  # fmt: skip
-    totals = torch.zeros(len(gaussians), remove.CHANGE_COUNT, dtype=torch.float64, device=changes.device)
+    totals = torch.zeros(len(gaussians), CHANGE_COUNT, dtype=torch.float64, device=changes.device)
     _sum_slots(changes, lists, totals, 2, tl.float64)
     # A maximum is the same in any order.
     largest = torch.zeros_like(totals[:, 0])
@@ -133,13 +135,13 @@ class _Blend(torch.autograd.Function):
         cotangents, ends = Cotangents(v_rgb, v_passed, v_depth_sum), Ends(transmittance, ctx.lasts, ctx.parts)
         plain = view.settings.plain_gradients
         absolute = ctx.needs_input_grad[5] and not plain
-        gradients, walked = differentiate_view(screen, view, ends, cotangents, absolute)
+        gradients = differentiate_view(screen, view, ends, cotangents, absolute)
         sums = transmittance.new_empty(len(fields[0]), gradients.shape[1])
-        _sum_slots(gradients, lists, sums, 16, tl.float32, walked)
+        _sum_slots(gradients, lists, sums, 16, tl.float32)
         outputs = [torch.empty_like(field) for field in fields]
         v_screen = transmittance.new_empty(len(fields[0]), 2)
         launch(
-            rows_backward.project_rows_backward, len(fields[0]), rows_backward.block_of(view),
+            project_rows_backward, len(fields[0]), block_of(view),
             *fields, given_or(ctx.displacements, fields[0]), screen.table, screen.records, screen.tile_counts, sums,
             *outputs, v_screen, len(fields[0]),
             SUMS=sums.shape[1], TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias,
@@ -153,16 +155,14 @@ def _of_gates(screen: Screen, sums: Float[Tensor, "n s"]) -> Float[Tensor, " n"]
     """Gradients of the gates; 0 for rows that were not drawn, whose sums are not written."""
     if not screen.gated:
         return None
-    return torch.where(screen.tile_counts > 0, sums[:, blend_backward.GATE_PLACE], 0.0)
+    return torch.where(screen.tile_counts > 0, sums[:, GATE_PLACE], 0.0)
 
 
-def _sum_slots(
-    values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype, walked: Tensor | None = None
-) -> None:
+def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl.dtype) -> None:
     launch(
-        slots.sum_slots, lists.sizes.rows, slots.ROWS,
-        values, given_or(walked, lists.rows), lists.rows, lists.row_ends, lists.tile_counts, sums, lists.sizes.rows,
-        COUNT=values.shape[1], PADDED=padded, SUM=kind, MARKED=walked is not None, options=slots.OPTIONS,
+        sum_slots, lists.sizes.rows, ROWS,
+        values, lists.rows, lists.row_ends, lists.tile_counts, sums, lists.sizes.rows,
+        COUNT=values.shape[1], PADDED=padded, SUM=kind, options=OPTIONS,
     )  # fmt: skip
 
 

@@ -9,11 +9,22 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.on_its_way import OnItsWay, on_its_way
-from sparsestreet.ops.triton import capacity, records, rows
 from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.lists import PAIR_LIMIT, Lists, Visible, check_pairs, list_rows, list_tiles
-from sparsestreet.ops.triton.sizes import COUNTED, Room, Sizes
-from sparsestreet.ops.triton.view import KernelView
+from sparsestreet.ops.triton.lists import (
+    PAIR_LIMIT,
+    Lists,
+    Visible,
+    check_pairs,
+    count_repeated,
+    like,
+    list_rows,
+    list_tiles,
+    predicted,
+    remember,
+)
+from sparsestreet.ops.triton.parts import COUNTED, Room, Sizes
+from sparsestreet.ops.triton.project import block_of, project_rows
+from sparsestreet.ops.triton.view import GATE_PLACE, LENGTH, KernelView
 from sparsestreet.ops.validate import check_values
 from sparsestreet.types import Gaussians
 
@@ -63,8 +74,8 @@ def draw(
     known too little for a guess, it waits in between.
     """
     projection, rows = project_all(gaussians, view, gates), len(gaussians)
-    place = capacity.like(rows, view, projection.records.device)
-    room = capacity.predicted(place, rows, PAIR_LIMIT)
+    place = like(rows, view, projection.records.device)
+    room = predicted(place, rows, PAIR_LIMIT)
     if room is not None:
         visible = list_visible_rows(projection, room, view)
         counted = on_its_way(visible.sizes.on_device)
@@ -72,12 +83,12 @@ def draw(
         layers = work(screen)
         read(visible.sizes, counted, gaussians, projection)
         if room.holds(visible.sizes.pairs, visible.sizes.rows):
-            capacity.remember(place, visible.sizes.rows, visible.sizes.pairs)
+            remember(place, visible.sizes.rows, visible.sizes.pairs)
             return screen, layers
-        capacity.count_repeated()
+        count_repeated()
         del screen, layers
     screen = list_exactly(gaussians, projection, view)
-    capacity.remember(place, screen.lists.sizes.rows, screen.lists.sizes.pairs)
+    remember(place, screen.lists.sizes.rows, screen.lists.sizes.pairs)
     return screen, work(screen)
 
 
@@ -86,19 +97,19 @@ def project_all(gaussians: Gaussians, view: KernelView, gates: Float[Tensor, " n
     fields, displacements = fields_of(gaussians), contiguous(gaussians.displacements)
     means, sh = fields[0], fields[4]
     n, settings, table = len(gaussians), view.settings, view.table(means.device)
-    splats, radii = means.new_empty(n, records.LENGTH), means.new_empty(n)
+    splats, radii = means.new_empty(n, LENGTH), means.new_empty(n)
     tile_counts = means.new_empty(n, dtype=torch.int32)
     # A program counts an empty scene too.
-    numbers = means.new_empty(3 * max(-(-n // rows.block_of(view)), 1), dtype=torch.int64)
+    numbers = means.new_empty(3 * max(-(-n // block_of(view)), 1), dtype=torch.int64)
     launch(
-        rows.project_rows, max(n, 1), rows.block_of(view),
+        project_rows, max(n, 1), block_of(view),
         *fields, given_or(displacements, means), table, splats, tile_counts, radii, numbers, n,
         TERMS=sh.shape[1], ANTIALIAS=settings.antialias, CLAMPED=settings.clamp_colors,
         HALF_COLORS=settings.half_colors, BOUNDED=view.bounded, **effects(view, displacements),
         options={"enable_fp_fusion": False},
     )  # fmt: skip
     if gates is not None:
-        splats[:, records.GATE_PLACE] = gates
+        splats[:, GATE_PLACE] = gates
     # Of one line, because torch sums the columns of a table one row after the other.
     return Projection(table, splats, tile_counts, radii, numbers.cumsum(0), gates is not None)
 

@@ -14,9 +14,8 @@ from torch.autograd.function import once_differentiable
 
 from sparsestreet.geometry.cameras import ray_directions, ray_matrix
 from sparsestreet.ops.cube_map import bordered_texels
-from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.launch import launch
-from sparsestreet.ops.triton.vectors import times
+from sparsestreet.ops.triton.launch import constant, jit, launch
+from sparsestreet.ops.triton.quaternions import times
 from sparsestreet.types import Camera
 
 LANES = 128

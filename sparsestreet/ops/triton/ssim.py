@@ -16,8 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sparsestreet.ops.ssim_window import C1, C2, WINDOW, window
-from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.launch import constant, jit, launch
 
 LANES = 128
 LINES = 32

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
+import triton
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
@@ -12,10 +13,91 @@ from torch import Tensor
 from sparsestreet.geometry.cameras import exact_position, numbers_of
 from sparsestreet.geometry.distortion import fold_radius_squared
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.triton.language import constant, jit
-from sparsestreet.ops.triton.launch import stream_of
-from sparsestreet.ops.triton.vectors import times
+from sparsestreet.ops.triton.launch import constant, jit, stream_of
+from sparsestreet.ops.triton.quaternions import times
 from sparsestreet.types import Camera
+
+LENGTH = 12
+RECORD = constant(LENGTH)
+X, Y, L11, L21, L22, LOG2_OPACITY = (constant(i) for i in range(6))
+# The exponent of 2 below which the splat is not drawn; then the color's three numbers and the depth.
+CUTOFF, COLOR, DEPTH = constant(6), constant(7), constant(10)
+# Written where rows have gates; of those without, nothing reads it.
+GATE_PLACE = 11
+GATE = constant(GATE_PLACE)
+
+
+@jit
+def record_of(records, row):
+    """Pointer to the record of a row."""
+    return records + row.to(tl.int64) * RECORD
+
+
+# Halvings of the widest tile, of 64 columns.
+LEVELS = constant(6)
+
+
+@jit
+def load_columns(table, row, mask, COUNT: tl.constexpr):
+    """COUNT numbers of each lane's row; 0 where the mask is off."""
+    width: tl.constexpr = 16 if COUNT % 16 == 0 else triton.next_power_of_2(COUNT)
+    tiles = ()
+    # All loads start before the first is waited for.
+    for first in tl.static_range(0, COUNT, width):
+        column = (first + tl.arange(0, width))[None, :]
+        tiles += (tl.load(table + row[:, None] * COUNT + column, mask[:, None] & (column < COUNT), 0.0),)
+    columns = ()
+    for i in tl.static_range(len(tiles)):
+        columns += unzipped(tiles[i], width)
+    return columns
+
+
+@jit
+def store_columns(table, row, values, mask, COUNT: tl.constexpr):
+    width: tl.constexpr = 16 if COUNT % 16 == 0 else triton.next_power_of_2(COUNT)
+    for first in tl.static_range(0, COUNT, width):
+        columns = ()
+        for i in tl.static_range(first, first + width):
+            columns += (values[i] if i < COUNT else values[0],)
+        column = (first + tl.arange(0, width))[None, :]
+        at = table + row[:, None] * COUNT + column
+        tl.store(at, zipped(columns, width), mask[:, None] & (column < COUNT))
+
+
+@jit
+def unzipped(tile, WIDTH: tl.constexpr):
+    """The columns of a tile [rows, WIDTH]."""
+    parts = (tile,)
+    # Each level has twice the parts of half the width.
+    for level in tl.static_range(LEVELS):
+        if WIDTH >> level > 1:
+            halves = ()
+            for i in tl.static_range(1 << level):
+                half = tl.reshape(parts[i], (tile.shape[0], 2, WIDTH >> (level + 1)))
+                left, right = tl.split(tl.permute(half, (0, 2, 1)))
+                halves += (left, right)
+            parts = halves
+    columns = ()
+    for i in tl.static_range(WIDTH):
+        columns += (tl.reshape(parts[i], (tile.shape[0],)),)
+    return columns
+
+
+@jit
+def zipped(columns, WIDTH: tl.constexpr):
+    """The tile [rows, WIDTH] of these columns."""
+    parts = ()
+    for i in tl.static_range(WIDTH):
+        parts += (tl.reshape(columns[i], (columns[i].shape[0], 1)),)
+    for level in tl.static_range(LEVELS):
+        if WIDTH >> level > 1:
+            pairs = ()
+            for i in tl.static_range(WIDTH >> (level + 1)):
+                both = tl.permute(tl.join(parts[2 * i], parts[2 * i + 1]), (0, 2, 1))
+                pairs += (tl.reshape(both, (columns[0].shape[0], 2 << level)),)
+            parts = pairs
+    return parts[0]
+
 
 TILE_SIZE = 16
 TILE = constant(TILE_SIZE)
@@ -156,3 +238,84 @@ def _slope_limits(focal: float, center: float, size: int) -> tuple[float, float]
     """Limits of x/z in the Jacobian: 1.3 tan(fov/2) of 3DGS, moved with the principal point."""
     margin = 0.3 * size / (2 * focal)
     return -center / focal - margin, (size - center) / focal + margin
+
+
+# Of ops/reference: rounding must never cull a touched pixel.
+BOX_MARGIN = constant(0.01)
+# The pixel loop's rounding grows with the distances it squares.
+RELATIVE_MARGIN = constant(1e-5)
+
+
+@jit
+def limited(value, least, most):
+    return tl.minimum(tl.maximum(value, least), most)
+
+
+@jit
+def tile_span(low, high, size):
+    """First and last tile with a pixel center in [low, high]; last < first if there is none. ``size`` in pixels."""
+    # Limited as floats, because the box of a giant does not fit an integer.
+    first = limited(tl.ceil(low - 0.5), 0.0, size).to(tl.int32)
+    last = limited(tl.floor(high - 0.5), -1.0, size - 1.0).to(tl.int32)
+    return first // TILE, tl.where(first <= last, last // TILE, first // TILE - 1)
+
+
+@jit
+def tile_rows(y, l22, reach, height, BOUNDED: tl.constexpr):
+    """First and last row of tiles a splat reaches; ``reach`` is log2 opacity - cutoff, L in the record's units."""
+    low = tl.zeros_like(y)
+    high = low + height
+    if BOUNDED:
+        half = tl.sqrt(reach) / l22
+        half += BOX_MARGIN + RELATIVE_MARGIN * half
+        low, high = y - half, y + half
+    return tile_span(low, high, height)
+
+
+@jit
+def half_chord(dy, half_width, half_y):
+    """Half the width of the ellipse at height dy."""
+    ratio = tl.where(half_y > 0, dy / half_y, 0.0)
+    return half_width * tl.sqrt(tl.maximum(1 - ratio * ratio, 0.0))
+
+
+@jit
+def lines_span(x, y, l11, l21, l22, reach, line, LINES: tl.constexpr):
+    """Least and largest x of the ellipse x(dy) = slope dy -+ half_chord(dy) within LINES lines of pixels from ``line``.
+
+    Also whether the ellipse reaches them. Margins are included."""
+    root = tl.sqrt(reach)
+    slope, half_width, half_y = -l21 / l11, root / l11, root / l22
+    half_x = root * tl.sqrt(l21 * l21 + l22 * l22) / (l11 * l22)
+    # The right-most point lies at dy = peak, the left-most at -peak.
+    peak = tl.where(half_x > 0, slope * half_y * half_y / half_x, 0.0)
+    margin_x, margin_y = BOX_MARGIN + RELATIVE_MARGIN * half_x, BOX_MARGIN + RELATIVE_MARGIN * half_y
+    top = line.to(tl.float32) + 0.5 - y
+    first, last = top - margin_y, top + (LINES - 1.0) + margin_y
+    low, high = limited(first, -half_y, half_y), limited(last, -half_y, half_y)
+    at_right, at_left = limited(peak, low, high), limited(-peak, low, high)
+    low_x = x + (slope * at_left - half_chord(at_left, half_width, half_y) - margin_x)
+    high_x = x + (slope * at_right + half_chord(at_right, half_width, half_y) + margin_x)
+    return low_x, high_x, (first <= half_y) & (last >= -half_y)
+
+
+@jit
+def tile_columns(x, y, l11, l21, l22, reach, row, width, BOUNDED: tl.constexpr):
+    """First and last tile of row ``row`` that the ellipse passes through."""
+    low_x = tl.zeros_like(x)
+    high_x = low_x + width
+    if BOUNDED:
+        low_x, high_x, _ = lines_span(x, y, l11, l21, l22, reach, row * TILE, TILE)
+    return tile_span(low_x, high_x, width)
+
+
+@jit
+def count_tiles(x, y, l11, l21, l22, reach, seen, width, height, BOUNDED: tl.constexpr):
+    """Number of tiles of each lane's splat; 0 where not ``seen``."""
+    first, last = tile_rows(y, l22, reach, height, BOUNDED)
+    rows = tl.where(seen, last - first + 1, 0)
+    count = 0 * first
+    for i in range(tl.max(rows, 0)):
+        left, right = tile_columns(x, y, l11, l21, l22, reach, first + i, width, BOUNDED)
+        count += tl.where(i < rows, right - left + 1, 0)
+    return count

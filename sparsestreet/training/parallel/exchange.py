@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.ranks import Ranks
-from sparsestreet.training.visible_adam import seen_rows
+from sparsestreet.training.adam import seen_rows
 
 
 @torch.no_grad()

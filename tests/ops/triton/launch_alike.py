@@ -12,8 +12,7 @@ import torch
 import triton
 import triton.language as tl
 
-from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.launch import jit, launch
 from tests.ops.triton.fake_driver import FakeDevice, install
 
 

@@ -16,13 +16,13 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sparsestreet.on_its_way import OnItsWay
 from sparsestreet.ops import splat, validate
-from sparsestreet.ops.triton import compose, lists, order, pixels, rasterizer, screen
+from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
 from sparsestreet.ops.triton.launch import launch
 from tests.ops.scenes import camera, cast, random_gaussians
 from tests.ops.triton.compile_offline import forbidden_in, instructions_of, resources_of
 from tests.ops.triton.fake_driver import Binary, FakeDevice, install
 
-MODULES: tuple[ModuleType, ...] = (screen, lists, order, pixels, rasterizer, compose)
+MODULES: tuple[ModuleType, ...] = (screen, lists, parts, pixels, rasterizer, pixels)
 ROWS, VISIBLE = 40, 30
 _ALLOCATIONS = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 

@@ -7,9 +7,8 @@ import torch
 
 from sparsestreet.on_its_way import OnItsWay
 from sparsestreet.ops import PairLimitError, SplatSettings, splat
-from sparsestreet.ops.triton import capacity, compose, lists, order, pixels, screen
-from sparsestreet.ops.triton.sizes import Room
-from sparsestreet.ops.triton.tuning import Tuning, tuned
+from sparsestreet.ops.triton import lists, parts, pixels, screen
+from sparsestreet.ops.triton.parts import Room
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -24,10 +23,11 @@ from tests.ops.scenes import (
     render,
 )
 from tests.ops.triton.recording import record_launches
+from tests.ops.triton.splitting import Rule, split_by
 
 DEVICE = device_of("triton")
 VIEW = camera(19, 17)
-PLACE = capacity.like(1000, KernelView(VIEW, SplatSettings()), DEVICE)
+PLACE = lists.like(1000, KernelView(VIEW, SplatSettings()), DEVICE)
 
 
 def scene() -> Gaussians:
@@ -38,8 +38,8 @@ def scene() -> Gaussians:
 
 def drawn(room: Room | None) -> dict[str, torch.Tensor]:
     """Images and gradients with that guess, in short parts."""
-    with pytest.MonkeyPatch.context() as patch, tuned(Tuning(shortest_part=2, fewest_parts=2)):
-        patch.setattr(capacity, "predicted", lambda *_: room)
+    with pytest.MonkeyPatch.context() as patch, split_by(Rule(min_part_pairs=2, min_parts=2)):
+        patch.setattr(screen, "predicted", lambda *_: room)
         result = render(scene(), VIEW, "triton", torch.float32)
     return result.images | result.gradients
 
@@ -65,9 +65,9 @@ def assert_same_bits(found: dict[str, torch.Tensor], exact: dict[str, torch.Tens
 @pytest.mark.parametrize("more", first_interpreted([3, 9], [0, 0], [1, 0], [0, 1], [400, 2000]))
 def test_any_room_that_is_large_enough_gives_the_same_bits(more, exact, taken, monkeypatch):
     fill_buffers_with_nan(monkeypatch)
-    before = capacity.repeated_forwards()
+    before = lists.repeated_forwards()
     assert_same_bits(drawn(Room(taken.rows + more[0], taken.pairs + more[1])), exact)
-    assert capacity.repeated_forwards() == before
+    assert lists.repeated_forwards() == before
 
 
 @pytest.mark.lengthy
@@ -77,9 +77,9 @@ def test_a_view_that_does_not_fit_is_drawn_again(short, exact, taken, monkeypatc
     room = {"both": Room(1, 1), "rows": Room(taken.rows - 1, taken.pairs), "pairs": Room(taken.rows, taken.pairs - 1)}[
         short
     ]
-    before = capacity.repeated_forwards()
+    before = lists.repeated_forwards()
     assert_same_bits(drawn(room), exact)
-    assert capacity.repeated_forwards() == before + 1
+    assert lists.repeated_forwards() == before + 1
 
 
 @pytest.mark.parametrize(("rows", "pairs", "fits"), [(0, 0, True), (-1, 9, False), (9, -1, False)])
@@ -126,9 +126,9 @@ def test_views_of_one_room_differ_in_addresses_alone(taken, monkeypatch):
         launches(kernel, items, block, *arguments, options=options, **constants)
 
     launches = screen.launch
-    for module in (screen, lists, order, pixels, compose):
+    for module in (screen, lists, parts, pixels, pixels):
         monkeypatch.setattr(module, "launch", launch)
-    monkeypatch.setattr(capacity, "predicted", lambda *_: Room(taken.rows + 5, taken.pairs + 40))
+    monkeypatch.setattr(screen, "predicted", lambda *_: Room(taken.rows + 5, taken.pairs + 40))
     other = dataclasses.replace(VIEW, camera_from_world=VIEW.camera_from_world.clone())
     other.camera_from_world[0, 3] += 0.2
     images = []
@@ -175,33 +175,33 @@ def test_pairs_beyond_32_bits_after_a_guess(monkeypatch):
     giant = one_gaussian(scales=[[1e7] * 3], opacities=[1.0])
     gaussians = cast(Gaussians.concatenate([giant] * 1050), torch.float32, device=DEVICE)
     monkeypatch.setattr(screen, "list_in", lambda *_: None)  # an image of gigabytes
-    monkeypatch.setattr(capacity, "predicted", lambda *_: Room(2000, 16))
+    monkeypatch.setattr(screen, "predicted", lambda *_: Room(2000, 16))
     view = KernelView(front_camera(2**22, 128, 100.0), SplatSettings())
     with pytest.raises(PairLimitError, match=f"cover {1050 * 2**21} tiles"):
         screen.draw(gaussians, view, lambda _: None)
 
 
 def test_room_for_a_quarter_more_than_the_largest_view():
-    assert capacity.predicted(PLACE, 1000, 10**9) is None
-    capacity.remember(PLACE, 600, 40_000)
-    capacity.remember(PLACE, 500, 80_000)
+    assert lists.predicted(PLACE, 1000, 10**9) is None
+    lists.remember(PLACE, 600, 40_000)
+    lists.remember(PLACE, 500, 80_000)
     # 750 and 100,000 in steps of an eighth of the power of two below.
-    assert capacity.predicted(PLACE, 1000, 10**9) == Room(768, 106_496)
+    assert lists.predicted(PLACE, 1000, 10**9) == Room(768, 106_496)
     # No more rows than there are, and no more pairs than may be held.
-    capacity.remember(PLACE, 1000, 80_000)
-    assert capacity.predicted(PLACE, 1000, 90_000) == Room(1024, 90_000)
+    lists.remember(PLACE, 1000, 80_000)
+    assert lists.predicted(PLACE, 1000, 90_000) == Room(1024, 90_000)
 
 
 def test_a_large_view_is_forgotten():
-    capacity.remember(PLACE, 800, 80_000)
+    lists.remember(PLACE, 800, 80_000)
     for _ in range(28):
-        capacity.remember(PLACE, 80, 8_000)
-    room = capacity.predicted(PLACE, 1000, 10**9)
+        lists.remember(PLACE, 80, 8_000)
+    room = lists.predicted(PLACE, 1000, 10**9)
     assert room is not None
     assert room.holds(80_000, 800)
     for _ in range(600):
-        capacity.remember(PLACE, 80, 8_000)
-    assert capacity.predicted(PLACE, 1000, 10**9) == Room(112, 10_240)
+        lists.remember(PLACE, 80, 8_000)
+    assert lists.predicted(PLACE, 1000, 10**9) == Room(112, 10_240)
 
 
 @pytest.mark.parametrize(
@@ -210,5 +210,5 @@ def test_a_large_view_is_forgotten():
     ids=["rows", "image"],
 )
 def test_other_views_tell_nothing(other):
-    capacity.remember(PLACE, 5, 9)
-    assert capacity.predicted(capacity.like(*other), 1000, 10**9) is None
+    lists.remember(PLACE, 5, 9)
+    assert lists.predicted(lists.like(*other), 1000, 10**9) is None

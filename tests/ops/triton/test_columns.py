@@ -4,9 +4,8 @@ import pytest
 import torch
 import triton.language as tl
 
-from sparsestreet.ops.triton.columns import load_columns, store_columns
-from sparsestreet.ops.triton.language import jit
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton.launch import jit, launch
+from sparsestreet.ops.triton.view import load_columns, store_columns
 from tests.ops.scenes import device_of
 
 DEVICE = device_of("triton")

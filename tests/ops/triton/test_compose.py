@@ -9,7 +9,7 @@ from torch import Tensor
 from sparsestreet.ops import splat
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.splat import _compose
-from sparsestreet.ops.triton.compose import Composed, compose, decompose
+from sparsestreet.ops.triton.pixels import Composed, compose, decompose
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 
 DEVICE = device_of("triton")

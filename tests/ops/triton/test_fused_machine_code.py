@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.ops.adam import adam_rows_
+from sparsestreet.ops.adam import AdamStep, adam_rows_, adam_step_
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
@@ -17,7 +17,6 @@ from sparsestreet.ops.triton import adam
 from sparsestreet.ops.triton import poses as fused_poses
 from sparsestreet.ops.triton import sky as fused_sky
 from sparsestreet.ops.triton import ssim as fused_ssim
-from sparsestreet.ops.visible_adam import AdamStep, adam_step_
 from tests.ops.scenes import camera, device_of
 from tests.ops.test_activate import case
 from tests.ops.test_activate import values_and_gradients as activated

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from sparsestreet.ops import SplatSettings, splat
-from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.scenes import (
     BACKENDS,
@@ -22,14 +21,13 @@ from tests.ops.scenes import (
     relative_error,
 )
 from tests.ops.test_gates import gated
+from tests.ops.triton.splitting import Rule, split_by
 from tests.ops.triton.test_parity import EFFECTS
 from tests.ops.triton.test_parts import stack
 from tests.typed import there
 
 DEVICE = device_of("triton")
-PARTS = Tuning(shortest_part=3)
-ALL_CHOICES = Tuning(shortest_part=3, marked_slots=True, staged=True)
-FOUR_LAUNCHES = Tuning(shortest_part=3, two_launches=False)
+PARTS = Rule(min_part_pairs=3)
 VIEW = front_camera(19, 9, 16.0)
 BACKGROUND = torch.tensor([0.3, 0.6, 0.1], dtype=torch.float64)
 LIMIT = 0.02
@@ -79,10 +77,9 @@ def assert_all_say_the_same(
 
 
 CASES = {
-    "exclusive, all choices": (EXCLUSIVE, ALL_CHOICES),
+    "exclusive, parts": (EXCLUSIVE, PARTS),
     "inclusive, parts": (INCLUSIVE, PARTS),
-    "exclusive, four launches": (EXCLUSIVE, FOUR_LAUNCHES),
-    "inclusive, whole tiles": (INCLUSIVE, Tuning()),
+    "inclusive, whole tiles": (INCLUSIVE, Rule()),
 }
 
 
@@ -91,7 +88,7 @@ def test_long_tiles(name, poisoned):
     """The bars are those of test_parts.py."""
     settings, choices = CASES[name]
     gaussians, gates = deep()
-    with tuned(choices):
+    with split_by(choices):
         gradients = assert_all_say_the_same(gaussians, VIEW, gates, settings, 1e-6, 1e-5)
     endless = replace(settings, transmittance_min=0.0)
     _, if_none_ended = gated(gaussians, VIEW, gates, "reference", settings=endless, background=BACKGROUND)
@@ -116,13 +113,11 @@ def test_sizes(size, fractions, poisoned):
     assert_all_say_the_same(random_gaussians(12, view, seed=7), view, gates, SplatSettings(), 1e-5, 1e-4)
 
 
-@pytest.mark.parametrize(
-    "choices", first_interpreted(Tuning(), replace(ALL_CHOICES, shortest_part=1)), ids=["whole tiles", "all choices"]
-)
+@pytest.mark.parametrize("choices", first_interpreted(Rule(), Rule(min_part_pairs=1)), ids=["whole tiles", "parts"])
 def test_open_gates_change_no_bit(choices, poisoned):
     """On a device the compiler may contract other products."""
     gaussians = stack(5, 0.9)
-    with tuned(choices):
+    with split_by(choices):
         plain, opened = (
             gated(gaussians, VIEW, gates, "triton", torch.float32, EXCLUSIVE, BACKGROUND)
             for gates in (None, torch.ones(6))
@@ -133,12 +128,10 @@ def test_open_gates_change_no_bit(choices, poisoned):
             torch.testing.assert_close(given[name], value, rtol=0.0, atol=rounding, msg=name)
 
 
-@pytest.mark.parametrize(
-    "choices", first_interpreted(Tuning(), replace(ALL_CHOICES, shortest_part=1)), ids=["whole tiles", "all choices"]
-)
+@pytest.mark.parametrize("choices", first_interpreted(Rule(), Rule(min_part_pairs=1)), ids=["whole tiles", "parts"])
 def test_closed_gates_show_the_background_and_still_learn(choices, poisoned):
     gaussians, gates = stack(5, 0.9), torch.zeros(6)
-    with tuned(choices):
+    with split_by(choices):
         images, gradients = gated(gaussians, VIEW, gates, "triton", torch.float32, background=BACKGROUND)
     assert torch.equal(images["rgb"], BACKGROUND.float().double().expand(9, 19, 3))
     assert not images["alpha"].any()

@@ -8,10 +8,10 @@ import torch
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.triton.parts import split_length
 from sparsestreet.ops.triton.screen import Screen, project
-from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.scenes import camera, cast, device_of, first_interpreted, front_camera, one_gaussian, random_gaussians
+from tests.ops.triton.splitting import Rule, split_by
 
 DEVICE = device_of("triton")
 WIDTH, HEIGHT, TILE = 587, 171, 16
@@ -126,7 +126,7 @@ def test_tiles_are_walked_nearest_first():
 def test_tiles_start_by_the_power_of_two_of_their_length_and_neighbors_follow_each_other(rows):
     view = camera(WIDTH, HEIGHT)
     scene = cast(random_gaussians(rows, view), torch.float32, device=DEVICE)
-    with tuned(Tuning(shortest_part=2)):
+    with split_by(Rule(min_part_pairs=2)):
         screen = project(scene, KernelView(view, SplatSettings()))
         lists, whole = screen.lists, split_length(len(screen.lists.slots))
     lengths = (lists.ends - lists.begins).tolist()

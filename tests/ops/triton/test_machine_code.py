@@ -21,10 +21,10 @@ import torch
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.settings import StopRule
 from sparsestreet.ops.triton import rasterizer
-from sparsestreet.ops.triton.tuning import Tuning, tuned
 from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
+from tests.ops.triton.splitting import Rule, split_by
 from tests.ops.triton.test_launch_path import BACKWARD as BACKWARD_PASS
 from tests.ops.triton.test_launch_path import FORWARD as FORWARD_PASS
 
@@ -67,7 +67,7 @@ EFFECTS = {"project_rows": _FORWARD, "project_rows_backward": _BACKWARD}
 
 
 def launches_of(
-    monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tuple[StopRule, ...], choices: list[Tuning]
+    monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tuple[StopRule, ...], choices: list[Rule]
 ) -> list[Launch]:
     """What these cases launch, and all that is counted, with these rules of where a pixel stops and these choices for
     split tiles."""
@@ -86,7 +86,7 @@ def launches_of(
     for stop in stops:
         contribution(scene, STILL, settings=SplatSettings(stop=stop), backend="triton")
     for gates, choice, stop in itertools.product((None, torch.ones(3, device=DEVICE)), choices, stops):
-        with tuned(choice):
+        with split_by(choice):
             splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop), gates=gates).depth.sum().backward()
     unique = {json.dumps(dataclasses.asdict(launch), sort_keys=True): launch for launch in launches}
     return list(unique.values())
@@ -98,13 +98,8 @@ def bare(launch: Launch, registers: int, **constants: bool) -> Launch:
     return dataclasses.replace(launch, constants=constants, options=launch.options | {"maxnreg": registers})
 
 
-SPLIT = Tuning(shortest_part=1, fewest_parts=2)
-TUNINGS = [
-    SPLIT,
-    dataclasses.replace(SPLIT, two_launches=False, staged=False),
-    dataclasses.replace(SPLIT, marked_slots=True, staged=False),
-]
-ALL = (TRAINED + OTHERS, ("inclusive", "exclusive"), TUNINGS)
+SPLIT = Rule(min_part_pairs=1, min_parts=2)
+ALL = (TRAINED + OTHERS, ("inclusive", "exclusive"), [SPLIT])
 SCOPES = {
     "trained, sm_90": (90, TRAINED, ("inclusive",), [SPLIT]),
     "all, sm_80": (80, *ALL),
@@ -134,8 +129,7 @@ def compiled_in(scope: str) -> list[tuple[Launch, dict]]:
     if cases is TRAINED:
         return compile_launches([launch for launch in launches if _is_daily(launch)], arch)
     first = {launch.name: launch for launch in reversed(launches) if launch.name.startswith("blend")}
-    forward, backward = first["blend_tiles"], first["blend_tiles_backward"]
-    launches += [bare(forward, 72, STAGED=False, LASTS=False), bare(forward, 80, STAGED=False)]
+    backward = first["blend_tiles_backward"]
     launches.append(bare(backward, 96, ABSOLUTE=False))
     launches.append(bare(backward, 104, ABSOLUTE=False, DEPTH=True))
     plain = [launch for launch in launches if launch.name in EFFECTS and _is_plain(launch)]
@@ -156,26 +150,21 @@ def test_every_kernel_is_compiled(compiled, request):
     names = {launch.name for launch, _ in compiled}
     if "trained" in request.node.name:
         assert names == {*BUDGETS, *ROW_BUDGETS, "count_tiles_pixels", "remove_from_tiles"}
-        names |= {*FORWARD_PASS, *BACKWARD_PASS, "thin_parts"}
+        names |= {*FORWARD_PASS, *BACKWARD_PASS}
     assert names == {
         "project_rows", "list_visible", "list_pairs", "bound_tiles", "order_tiles", "blend_tiles",
         "count_tiles_pixels", "blend_tiles_backward", "sum_slots", "project_rows_backward", "remove_from_tiles",
-        "thin_parts", "compose_pixels", "decompose_pixels",
+        "compose_pixels", "decompose_pixels",
     }  # fmt: skip
 
 
 def test_nothing_spills(compiled, request):
-    """But 8 bytes outside of the loop for staged records, and for gates on sm_80; and on sm_120, where registers were
-    not tuned, once in the loop of both."""
-    newest, oldest = "sm_120" in request.node.name, "sm_80" in request.node.name
+    """But 8 bytes outside the loop of the forward blend; on sm_120, where registers were not tuned, once in it."""
+    newest = "sm_120" in request.node.name
     for launch, found in compiled:
-        gated = launch.name == "blend_tiles" and launch.constants["GATED"]
-        assert found["spilled"] <= 8 * (_is_staged(launch) or (oldest and gated)) or newest, launch
-        assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and (gated or _is_staged(launch))), launch
-
-
-def _is_staged(launch: Launch) -> bool:
-    return bool(launch.constants.get("STAGED"))
+        is_forward = launch.name == "blend_tiles"
+        assert found["spilled"] <= 8 * is_forward or newest, launch
+        assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and is_forward), launch
 
 
 def test_no_tensor_cores_and_no_atomics(compiled):
@@ -185,35 +174,17 @@ def test_no_tensor_cores_and_no_atomics(compiled):
 
 # Switches that are on: registers, instructions per sample.
 FORWARD = {
-    "": (72, 21.0),
-    "LASTS": (80, 22.0),
-    "DEPTH STAGED": (96, 22.0),
-    "DEPTH LASTS": (80, 23.5),
-    "DEPTH LASTS STAGED": (96, 23.5),
-    "DEPTH LASTS TOGETHER": (80, 24.0),
-    "DEPTH LASTS PARTS REST": (80, 23.5),
-    "DEPTH LASTS PARTS": (80, 23.5),
-    "DEPTH LASTS STAGED TOGETHER": (96, 24.0),
-    "DEPTH LASTS PARTS REST STAGED": (96, 23.5),
-    "DEPTH EXCLUSIVE LASTS": (88, 26.0),
-    "DEPTH EXCLUSIVE LASTS STAGED": (96, 26.0),
-    "DEPTH EXCLUSIVE LASTS TOGETHER": (88, 26.0),
-    "DEPTH EXCLUSIVE LASTS PARTS REST": (88, 26.0),
-    "DEPTH EXCLUSIVE LASTS PARTS": (88, 26.0),
-    "DEPTH EXCLUSIVE LASTS STAGED TOGETHER": (96, 26.0),
-    "DEPTH EXCLUSIVE LASTS PARTS REST STAGED": (96, 26.0),
-    "DEPTH GATED LASTS": (80, 24.5),
-    "DEPTH GATED LASTS TOGETHER": (80, 25.0),
-    "DEPTH GATED LASTS PARTS REST": (80, 24.5),
-    "DEPTH GATED LASTS PARTS": (80, 24.5),
-    "DEPTH GATED LASTS STAGED TOGETHER": (104, 25.5),
-    "DEPTH GATED LASTS PARTS REST STAGED": (104, 25.0),
-    "DEPTH EXCLUSIVE GATED LASTS": (88, 27.0),
-    "DEPTH EXCLUSIVE GATED LASTS TOGETHER": (88, 27.0),
-    "DEPTH EXCLUSIVE GATED LASTS PARTS REST": (88, 27.0),
-    "DEPTH EXCLUSIVE GATED LASTS PARTS": (88, 27.0),
-    "DEPTH EXCLUSIVE GATED LASTS STAGED TOGETHER": (104, 27.0),
-    "DEPTH EXCLUSIVE GATED LASTS PARTS REST STAGED": (104, 27.0),
+    "DEPTH": (96, 22.0),
+    "DEPTH LASTS": (96, 23.5),
+    "DEPTH LASTS TOGETHER": (96, 24.0),
+    "DEPTH LASTS REST": (96, 23.5),
+    "DEPTH EXCLUSIVE LASTS": (96, 26.0),
+    "DEPTH EXCLUSIVE LASTS TOGETHER": (96, 26.0),
+    "DEPTH EXCLUSIVE LASTS REST": (96, 26.0),
+    "DEPTH GATED LASTS TOGETHER": (104, 25.5),
+    "DEPTH GATED LASTS REST": (104, 25.0),
+    "DEPTH EXCLUSIVE GATED LASTS TOGETHER": (104, 27.0),
+    "DEPTH EXCLUSIVE GATED LASTS REST": (104, 27.0),
 }
 BACKWARD = {
     "": (96, 53.0),
@@ -221,15 +192,10 @@ BACKWARD = {
     "ABSOLUTE": (96, 58.5),
     "ABSOLUTE DEPTH": (104, 61.0),
     "ABSOLUTE DEPTH TOGETHER": (104, 61.0),
-    "ABSOLUTE DEPTH PARTS": (104, 61.0),
-    "ABSOLUTE DEPTH MARKED TOGETHER": (104, 62.0),
-    "ABSOLUTE DEPTH GATED": (112, 66.5),
     "ABSOLUTE DEPTH GATED TOGETHER": (112, 66.5),
-    "ABSOLUTE DEPTH GATED PARTS": (112, 66.5),
-    "ABSOLUTE DEPTH GATED MARKED TOGETHER": (112, 67.5),
 }
 OF_TRAINING = {
-    "blend_tiles": ("DEPTH LASTS STAGED", "DEPTH LASTS STAGED TOGETHER", "DEPTH GATED LASTS STAGED TOGETHER"),
+    "blend_tiles": ("DEPTH LASTS", "DEPTH LASTS TOGETHER", "DEPTH GATED LASTS TOGETHER"),
     "blend_tiles_backward": ("ABSOLUTE DEPTH TOGETHER", "ABSOLUTE DEPTH GATED TOGETHER"),
 }
 """Of a kernel's variants those with the most loops and registers. The others are compiled by ``make test-all``."""
@@ -247,9 +213,9 @@ def test_budget_of_the_pixel_loops(compiled):
         registers, instructions = BUDGETS[launch.name][switches]
         assert found["registers"] <= registers, (launch.name, switches)
         assert found["sample"] <= instructions, (launch.name, switches)
-        # Staged, only the next pair's row and quadrants are loaded, and eleven numbers change lanes, or a gate too.
-        loop = found["loops"][-1]
-        if _is_staged(launch):
+        if launch.name == "blend_tiles":
+            # Only the next pair's row and quadrants are loaded, and eleven numbers change lanes, or a gate too.
+            loop = found["loops"][-1]
             assert (loop["loads"], loop["exchanges"]) == (1, 11 + launch.constants["GATED"])
         # What a part lets through is a second, shorter loop.
         assert len(found["loops"]) == (2 if launch.name == "blend_tiles" and launch.constants["TOGETHER"] else 1)

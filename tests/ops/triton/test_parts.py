@@ -1,6 +1,5 @@
 """Long tiles in parts: the same image and gradients as in one piece, for any length of the parts."""
 
-import dataclasses
 import math
 
 import pytest
@@ -9,9 +8,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
-from sparsestreet.ops.triton import blend_backward, pixels, rasterizer
+from sparsestreet.ops.triton import pixels, rasterizer
 from sparsestreet.ops.triton.parts import part_length, split_length
-from sparsestreet.ops.triton.tuning import Tuning, tuned, tuning
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -25,6 +23,7 @@ from tests.ops.scenes import (
     relative_error,
     render,
 )
+from tests.ops.triton.splitting import Rule, split_by
 from tests.ops.triton.tile_lists import lists_of
 
 DEVICE = device_of("triton")
@@ -55,7 +54,7 @@ VIEW = front_camera(27, 11, 22.0)
 
 @pytest.fixture
 def short_parts():
-    with tuned(Tuning(shortest_part=3)):
+    with split_by(Rule(min_part_pairs=3)):
         yield
 
 
@@ -84,35 +83,12 @@ def test_against_the_reference(name, short_parts):
         assert relative_error(result.gradients[field], gradient) <= 1e-5, field
 
 
-def test_each_backward_launch_writes_its_own_slots_alone(short_parts, monkeypatch):
-    """The launch over whole tiles leaves the pairs of split tiles to the launch over parts."""
-    started, written = pixels.launch, {}
-
-    def launch(kernel, items, block, *arguments, **options):
-        if kernel is blend_backward.blend_tiles_backward:
-            slots = [a for a in arguments if isinstance(a, torch.Tensor) and a.shape[1:] == (12,)][-1]
-            slots.fill_(torch.nan)
-            started(kernel, items, block, *arguments, **options)
-            written[options["PARTS"]] = slots.isfinite().all(1)
-        else:
-            started(kernel, items, block, *arguments, **options)
-
-    monkeypatch.setattr(pixels, "launch", launch)
-    gaussians = cast(stack(13), torch.float32, requires_grad=True, device=DEVICE)
-    # Wider than VIEW: one tile is not split.
-    with tuned(dataclasses.replace(tuning(), two_launches=False)):
-        splat(gaussians, front_camera(48, 11, 22.0), backend="triton").rgb.sum().backward()
-    assert written[True].any()
-    assert written[False].any()
-    assert torch.equal(written[False], ~written[True])
-
-
 @pytest.mark.parametrize("length", first_interpreted(4, 1))
 def test_any_length_draws_the_same(length):
     view = camera(19, 17)
     scene = random_gaussians(12, view)
     whole = render(scene, view, "triton", torch.float32)
-    with tuned(Tuning(shortest_part=length, fewest_parts=2)):
+    with split_by(Rule(min_part_pairs=length, min_parts=2)):
         split = render(scene, view, "triton", torch.float32)
     for name, image in whole.images.items():
         torch.testing.assert_close(split.images[name], image, rtol=1e-6, atol=1e-6)
@@ -155,22 +131,21 @@ def test_counting_and_removal_walk_whole_tiles(short_parts):
     truth = contribution(scene, VIEW, backend="reference")
     counted = contribution(single, VIEW, backend="triton")
     assert torch.equal(counted.dominant.cpu(), truth.dominant)
-    with tuned(Tuning()):
+    with split_by(Rule()):
         whole = rasterizer.leave_one_out(single, None, None, VIEW, SplatSettings())
     split = rasterizer.leave_one_out(single, None, None, VIEW, SplatSettings())
     torch.testing.assert_close(split.squared_change, whole.squared_change, rtol=1e-5, atol=1e-9)
     torch.testing.assert_close(split.max_abs_change, whole.max_abs_change, rtol=1e-5, atol=1e-7)
 
 
-@pytest.mark.parametrize("staged", first_interpreted(True, False))
-def test_parts_longer_than_a_look(staged):
+def test_parts_longer_than_a_look():
     # Both parts hold 35 splats and are looked at after 32, when half the light still passes.
     layers = [
         one_gaussian(means=[[0.0, 0.0, 2 + 0.1 * k]], scales=[[90.0] * 3], opacities=[0.02], sh=[[[0.01 * k] * 3]])
         for k in range(70)
     ]
     scene, view = Gaussians.concatenate(layers), front_camera(3, 2, 20.0)
-    with tuned(Tuning(shortest_part=33, fewest_parts=2, staged=staged)):
+    with split_by(Rule(min_part_pairs=33, min_parts=2)):
         drawn = splat(cast(scene, torch.float32, device=DEVICE), view, backend="triton")
     truth = splat(scene, view, backend="reference")
     assert (drawn.rgb.cpu() - truth.rgb).abs().max() < 1e-6
@@ -191,7 +166,7 @@ def test_parts_longer_than_a_look(staged):
 @example([7, 3, 0] * 200, 2, 12, 2, 0)
 def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
     pairs = sum(counts)
-    with tuned(Tuning(most_parts=limit, shortest_part=length, fewest_parts=fewest)):
+    with split_by(Rule(max_parts=limit, min_part_pairs=length, min_parts=fewest)):
         share, least = part_length(pairs), split_length(pairs)
         begins, ends, order, found = lists_of(counts, pairs + more)
     assert ends.tolist() == torch.tensor(counts).cumsum(0).tolist()
@@ -223,16 +198,3 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
     assert [int(end) for end in found.whole_ends] == [
         int(begins[tile] if tile in long else ends[tile]) for tile in range(len(counts))
     ]
-
-
-def test_a_tuning_that_splits_nothing_into_nothing_is_refused():
-    for wrong in ((0, 1, 2), (1, 0, 2), (1, 1, 1)):
-        with pytest.raises(ValueError, match="at least 2 parts, got Tuning"):
-            Tuning(*wrong)
-
-
-def test_a_tuning_holds_in_its_block_alone():
-    with tuned(Tuning(shortest_part=3)), pytest.raises(KeyError), tuned(Tuning(shortest_part=4)):
-        assert part_length(10) == 4
-        raise KeyError
-    assert part_length(10) == 128

@@ -5,7 +5,6 @@ import pytest
 from numpy.typing import NDArray
 
 from sparsestreet.ops.triton.parts import split_length
-from sparsestreet.ops.triton.tuning import Tuning, tuned, tuning
 from tests.ops.triton.device_model import (
     BACKWARD,
     FORWARD,
@@ -17,6 +16,7 @@ from tests.ops.triton.device_model import (
     together,
     two_launches,
 )
+from tests.ops.triton.splitting import Rule, split_by
 from tests.ops.triton.tile_lists import lists_of
 
 # Pairs of a tile, counted on views of two trained streets: ten front views of one, scaled to the mean of a street of
@@ -27,7 +27,7 @@ STREETS = {
     "one view": ({0: 0, 0.1: 25, 0.5: 421, 0.65: 700, 0.8: 1150, 0.9: 2108, 0.97: 2900, 0.99: 4494, 1: 7925}, 2160),
     "ten views, 1920x1280": ({0: 0, 0.1: 40, 0.5: 529, 0.65: 800, 0.8: 1350, 0.9: 2268, 0.99: 3473, 1: 4958}, 9600),
 }
-UNSPLIT = Tuning(most_parts=1)
+UNSPLIT = Rule(max_parts=1)
 
 
 def split(lengths: NDArray[np.int64]) -> Split:
@@ -73,14 +73,14 @@ def test_no_chain_is_longer_than_the_devices_share(name):
     lengths = lengths_of(*STREETS[name])
     found = split(lengths)
     assert found.parts
-    assert min(map(len, found.parts)) >= tuning().fewest_parts
+    assert min(map(len, found.parts)) >= Rule().min_parts
     assert max(found.chains) <= 1.3 * lengths.sum() / WARPS
 
 
 def test_small_views_are_split_to_occupy_a_device():
     """240 tiles (320x192)."""
     found = split(lengths_of(STREETS["one view"][0], 240) * 7 // 10)
-    assert max(found.chains) <= tuning().fewest_parts * 128
+    assert max(found.chains) <= Rule().min_parts * 128
     assert len(found.whole) + sum(map(len, found.parts)) > 1000
 
 
@@ -94,10 +94,10 @@ def test_no_tile_is_split_of_many_alike(tiles):
 def test_a_street_takes_half_the_time_with_its_tiles_split(name):
     lengths = lengths_of(*STREETS[name])
     found, four_means = split(lengths), round(2 * lengths.mean())
-    with tuned(UNSPLIT):
+    with split_by(UNSPLIT):
         whole = split(lengths)
     # The rule that was measured: from four times the mean on, into parts of at least twice the mean.
-    with tuned(Tuning(most_parts=-(-int(lengths.sum()) // four_means), fewest_parts=2)):
+    with split_by(Rule(max_parts=-(-int(lengths.sum()) // four_means), min_parts=2)):
         measured = split(lengths)
     assert whole.parts == []
     for fit in FORWARD:

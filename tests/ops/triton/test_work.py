@@ -3,7 +3,7 @@
 import torch
 
 from sparsestreet.ops import SplatSettings
-from sparsestreet.ops.triton.work import count_work
+from sparsestreet.ops.triton.counters import count_work
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import cast, device_of, front_camera, one_gaussian
 

@@ -6,9 +6,8 @@ from unittest.mock import patch
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.triton import order
-from sparsestreet.ops.triton.parts import Parts
-from sparsestreet.ops.triton.sizes import Sizes
+from sparsestreet.ops.triton import parts as order
+from sparsestreet.ops.triton.parts import Parts, Sizes
 from tests.ops.scenes import device_of
 
 DEVICE = device_of("triton")

@@ -1,0 +1,127 @@
+"""Images by the C++ library: the sky behind the splats, and D-SSIM."""
+
+import itertools
+from ctypes import byref, c_double
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sparsestreet.geometry.cameras import ray_directions, ray_matrix
+from sparsestreet.ops.cpu import library as native
+from sparsestreet.ops.cpu.library import FASTEST_VARIANT
+from sparsestreet.ops.cube_map import bordered_texels
+from sparsestreet.ops.ssim_window import C1, C2, WINDOW, window
+from sparsestreet.phases import phase
+from sparsestreet.types import Camera
+
+
+def over_sky(
+    rgb: Float[Tensor, "h w 3"],
+    alpha: Float[Tensor, "h w"],
+    texels: Float[Tensor, "6 r r 3"],
+    camera: Camera,
+    transmittance_min: float,
+    variant: int = FASTEST_VARIANT,
+) -> Float[Tensor, "h w 3"]:
+    """``sparsestreet.ops.over_sky`` of contiguous tensors of one dtype, float32 or float64.
+
+    Values and gradients are bitwise the same for any number of threads. ``variant`` is as for the splats."""
+    return _OverSky.apply(rgb, alpha, texels, camera, transmittance_min, variant)
+
+
+class _OverSky(torch.autograd.Function):
+    """Adds the sky. Backward reads the texels again, because keeping an image of colors would cost more."""
+
+    @staticmethod
+    def forward(ctx, rgb, alpha, texels, camera, transmittance_min, variant):
+        out = torch.empty_like(rgb)
+        directions = None if camera.distortion is None else ray_directions(camera).to(rgb)
+        sky = _sky(texels, camera, transmittance_min, directions)
+        native.load_library().splat_over_sky(
+            rgb.dtype == torch.float64, variant, byref(sky), rgb.data_ptr(), alpha.data_ptr(), out.data_ptr()
+        )
+        ctx.save_for_backward(alpha, texels, directions)
+        ctx.camera, ctx.transmittance_min, ctx.variant = camera, transmittance_min, variant
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_out):
+        with phase("sky backward"):
+            alpha, texels, directions = ctx.saved_tensors
+            _, wants_alpha, wants_texels, *_ = ctx.needs_input_grad
+            v_alpha = torch.empty_like(alpha) if wants_alpha else None
+            v_texels = torch.empty_like(texels) if wants_texels else None
+            sky = _sky(texels, ctx.camera, ctx.transmittance_min, directions)
+            cotangent = v_out.contiguous()
+            native.load_library().splat_over_sky_backward(
+                alpha.dtype == torch.float64, ctx.variant, byref(sky), alpha.data_ptr(), cotangent.data_ptr(),
+                *(None if gradient is None else gradient.data_ptr() for gradient in (v_alpha, v_texels)),
+            )  # fmt: skip
+            return v_out, v_alpha, v_texels, None, None, None
+
+
+def _sky(texels: Tensor, camera: Camera, transmittance_min: float, directions: Tensor | None) -> native.CSky:
+    return native.CSky(
+        rays=(c_double * 9)(*itertools.chain(*ray_matrix(camera))),
+        transmittance_min=transmittance_min,
+        width=camera.width,
+        height=camera.height,
+        side=texels.shape[1],
+        threads=native.thread_count(),
+        bordered=bordered_texels(texels.shape[1], texels.device).data_ptr(),
+        texels=texels.data_ptr(),
+        directions=None if directions is None else directions.data_ptr(),
+    )
+
+
+TAPS = (c_double * WINDOW)(*window())
+
+
+def mean_ssim(
+    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], variant: int = FASTEST_VARIANT
+) -> Float[Tensor, ""]:
+    """``sparsestreet.ops.ssim.ssim`` of contiguous images, both float32 or both float64.
+
+    Bitwise the same for any number of threads. ``variant`` picks an instruction set, as in
+    :func:`sparsestreet.ops.cpu.rasterizer.rasterize`. Raises MemoryError without room for the sums.
+    """
+    return _MeanSSIM.apply(image, truth, variant)
+
+
+class _MeanSSIM(torch.autograd.Function):
+    """Forward keeps three partial derivatives per number of the SSIM map; backward blurs them."""
+
+    @staticmethod
+    def forward(ctx, image, truth, variant):
+        height, width, channels = image.shape
+        kept = 3 if ctx.needs_input_grad[0] else 0
+        partials = image.new_empty(kept, height - WINDOW + 1, width - WINDOW + 1, channels)
+        mean = image.new_empty(())
+        kind = (image.dtype == torch.float64, variant)
+        status = native.load_library().splat_ssim(
+            *kind, byref(_pair(image, truth)), partials.data_ptr() if kept else None, mean.data_ptr()
+        )
+        if status != native.STATUS_OK:
+            raise MemoryError("no memory for the sums of SSIM: compare smaller images")
+        ctx.save_for_backward(image, truth, partials)
+        ctx.kind = kind
+        return mean
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v_mean):
+        image, truth, partials = ctx.saved_tensors
+        v_image = torch.empty_like(image)
+        with phase("ssim backward"):
+            native.load_library().splat_ssim_backward(
+                *ctx.kind, byref(_pair(image, truth)), partials.data_ptr(), v_mean.data_ptr(), v_image.data_ptr()
+            )
+        return v_image, None, None
+
+
+def _pair(image: Tensor, truth: Tensor) -> native.CImagePair:
+    height, width, _ = image.shape
+    return native.CImagePair(image.data_ptr(), truth.data_ptr(), height, width, TAPS, C1, C2, native.thread_count())
