@@ -128,8 +128,7 @@ class OrderedFrames:
                 processes, each one has all: an iteration of none would be left out.
         """
         places = list(range(len(frames)) if limit is None else spread(len(frames), limit))
-        self.shared = 1 < ranks.size <= len(places)
-        self.frames = frames.at(ranks.share(places) if self.shared else places)
+        self.frames = frames.at(ranks.share(places) if ranks.size <= len(places) else places)
         self._device = device
 
     def __len__(self) -> int:
@@ -197,7 +196,6 @@ class StreetData(LightningDataModule):
 
     def train_dataloader(self) -> ShuffledFrames:
         """One training frame a step; an epoch is all of them in random order."""
-        trainer = self.trainer
         trainer = self.trainer
         if self.split.train.forecast is not None:
             logger.info("%s", self.split.train.forecast())

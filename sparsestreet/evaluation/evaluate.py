@@ -11,10 +11,10 @@ from sparsestreet.data.device import to_device
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.lidar import near_returns
 from sparsestreet.evaluation.predictions import Predictions, quantized, restored
-from sparsestreet.metrics import image as metrics
-from sparsestreet.metrics import ssim
-from sparsestreet.metrics.definitions import GAUSS_WINDOW, LPIPS_SIDES, quantities_of
-from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
+from sparsestreet.metrics.definitions import quantities_of
+from sparsestreet.metrics.image import psnr_of_mse
+from sparsestreet.metrics.lpips import Lpips
+from sparsestreet.metrics.reported import ImageMetric, errors_by_region, reported_metrics
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.quality import FrameQuality, RegionQuality
 from sparsestreet.scene.graph import SceneGraph
@@ -63,16 +63,17 @@ def evaluate_frames(
     Raises ValueError for a render that is not finite (in all processes), OSError where a prediction cannot be written,
     LostProcessError.
     """
+    metrics = reported_metrics(lpips or {})
     if ranks.size > 1:
         views = frames if isinstance(frames, Frames) else Frames.of(tuple(frames))
-        yield from _of_all(scene, views, options, predictions, lpips, ranks)
+        yield from _of_all(scene, views, options, predictions, metrics, ranks)
         return
     for frame in frames:
         pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         if predictions is not None:
             predictions.write(*frame.indices, pixels)
             pixels = predictions.read(*frame.indices)
-        yield _quality(pixels, frame, scene.device, lpips)
+        yield _quality(pixels, frame, scene.device, metrics)
 
 
 def _of_all(
@@ -80,7 +81,7 @@ def _of_all(
     frames: Frames,
     options: RenderOptions,
     predictions: Predictions | None,
-    lpips: Mapping[str, Lpips] | None,
+    metrics: Mapping[str, ImageMetric],
     ranks: Ranks,
 ) -> Iterator[FrameQuality]:
     """A round takes a frame of each process, whose pixels travel to the first: only its disk need hold the run."""
@@ -93,7 +94,7 @@ def _of_all(
             pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         except ValueError as error:
             return error
-        return (None if predictions is None else pixels), _quality(pixels, frame, scene.device, lpips)
+        return (None if predictions is None else pixels), _quality(pixels, frame, scene.device, metrics)
 
     for first in range(0, len(frames), ranks.size):
         for found in ranks.gathered(look(first + ranks.rank)):
@@ -117,24 +118,33 @@ def evaluate_predictions(
 
     Raises PredictionError for a prediction that is absent or damaged.
     """
+    metrics = reported_metrics(lpips or {})
     for frame in frames:
         pixels = predictions.read(*frame.indices)
-        yield _quality(pixels, frame, device, lpips)
+        yield _quality(pixels, frame, device, metrics)
 
 
 def _quality(
-    pixels: UInt16[np.ndarray, "h w 3"], frame: Frame, device: torch.device, lpips: Mapping[str, Lpips] | None
+    pixels: UInt16[np.ndarray, "h w 3"], frame: Frame, device: torch.device, metrics: Mapping[str, ImageMetric]
 ) -> FrameQuality:
-    return frame_quality(torch.from_numpy(restored(pixels)).to(device), to_device(frame, device), lpips or {})
+    return frame_quality(torch.from_numpy(restored(pixels)).to(device), to_device(frame, device), metrics)
 
 
 @torch.no_grad()
-def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame, lpips: Mapping[str, Lpips]) -> FrameQuality:
+def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame, metrics: Mapping[str, ImageMetric]) -> FrameQuality:
     """Compare one clamped render [0, 1] with the frame's image, in full and by region; both on one device."""
-    height, width = frame.image.shape[:2]
-    measured = _Measured(rgb, frame.image.float() / 255, lpips)
-    regions = {name: measured.within(name, mask) for name, mask in region_masks(frame).items()}
-    return FrameQuality(*frame.indices, width, height, {"full": measured.whole()} | regions)
+    truth, masks = frame.image.float() / 255, region_masks(frame)
+    errors = errors_by_region(rgb, truth, masks)
+    values = {name: metric.measure(rgb, truth, masks) for name, metric in metrics.items()}
+    values["mse"] = errors
+    values["psnr"] = {region: None if error is None else psnr_of_mse(error) for region, error in errors.items()}
+    height, width = truth.shape[:2]
+    pixels = {"full": height * width} | {region: int(mask.sum()) for region, mask in masks.items()}
+    regions = {
+        region: RegionQuality(count, **{name: values[name][region] for name in quantities_of(region) if name in values})
+        for region, count in pixels.items()
+    }
+    return FrameQuality(*frame.indices, width, height, regions)
 
 
 def region_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
@@ -159,37 +169,3 @@ def lidar_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
     for mask in (frame.sky, frame.ego):
         ground = ground if mask is None else ground & ~mask
     return {"near_lidar": near & ground, "beyond_lidar": ~near & ground}
-
-
-class _Measured:
-    """One pair of images with what all regions share: the render in 8 bits, and maps of similarity and distance."""
-
-    def __init__(self, rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], lpips: Mapping[str, Lpips]) -> None:
-        self.rgb, self.truth, self.rgb8 = rgb, truth, metrics.rounded(rgb)
-        shorter = min(rgb.shape[:2])
-        self.windows = {"ssim_uniform7": ssim.UNIFORM7}
-        if shorter >= GAUSS_WINDOW:
-            self.windows["ssim_gauss11"] = ssim.GAUSS11
-        self.maps = {name: ssim.ssim_map(rgb, truth, window) for name, window in self.windows.items()}
-        self.layers = {name: one.layer_maps(rgb, truth) for name, one in lpips.items() if shorter >= LPIPS_SIDES[name]}
-
-    def whole(self) -> RegionQuality:
-        error = metrics.mse(self.rgb, self.truth)
-        return RegionQuality(
-            pixels=self.rgb.shape[0] * self.rgb.shape[1],
-            mse=error,
-            psnr=metrics.psnr_of_mse(error),
-            psnr8=metrics.psnr(self.rgb8, self.truth),
-            **{name: ssim.ssim_of_map(self.maps[name], window) for name, window in self.windows.items()},
-            **{name: lpips_of_layers(layers) for name, layers in self.layers.items()},
-        )
-
-    def within(self, region: str, mask: Bool[Tensor, "h w"]) -> RegionQuality:
-        error = metrics.masked_mse(self.rgb, self.truth, mask)
-        if error is None:
-            return RegionQuality(0, None, None, None)
-        values: dict[str, float | None] = {"mse": error, "psnr": metrics.psnr_of_mse(error)}
-        values["psnr8"] = metrics.masked_psnr(self.rgb8, self.truth, mask)
-        values |= {name: ssim.masked_ssim_of_map(one, mask) for name, one in self.maps.items()}
-        values |= {name: masked_lpips_of_layers(layers, mask) for name, layers in self.layers.items()}
-        return RegionQuality(int(mask.sum()), **{name: values.get(name) for name in quantities_of(region)})

@@ -5,7 +5,6 @@ Distances of sets of images say little of few images, and something of the shift
 
 from collections.abc import Sequence
 from dataclasses import replace
-from statistics import fmean
 
 import numpy as np
 import torch
@@ -17,10 +16,10 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Truth
 from sparsestreet.evaluation.evaluate import screen_image
 from sparsestreet.geometry.cameras import moved
-from sparsestreet.metrics.distances import frechet_distance, frechet_name, kernel_distance, kernel_name
+from sparsestreet.metrics.definitions import metric_id
 from sparsestreet.metrics.extractors import Extractor
-from sparsestreet.metrics.image import masked_psnr, psnr
 from sparsestreet.metrics.lpips import Lpips
+from sparsestreet.metrics.reported import PerceptualDistance, Psnr, SetDistances
 from sparsestreet.records.novel import NovelRecord, NovelShift
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
@@ -62,25 +61,39 @@ def evaluate_novel(
     if len(frames) < 2:
         extractor, absent = None, "distances need at least two images: hold out more views"
     device = scene.device
-    real = None if extractor is None else _features(extractor, frames, device)
+    # One process measures: the others wait for nobody.
+    distances = None if extractor is None else SetDistances(extractor, sync_on_compute=False)
+    quality = Psnr(("full", "human", "vehicle"), sync_on_compute=False)
+    perceptual = None if lpips is None else PerceptualDistance(lpips, sync_on_compute=False)
+    metrics = [metric for metric in (quality, perceptual, distances) if metric is not None]
+    if distances is not None:
+        for frame in frames:
+            distances.update(frame.image.to(device).float() / 255, real=True)
 
     def shift(offset: float) -> NovelShift:
         views = shifted_views(frames.views, offset, ramp)
-        features, quality = [], []
+        true_views, numbers = 0, {}
         for view in views:
             image = screen_image(scene, view, options)
-            if extractor is not None:
-                features.append(extractor(image))
+            if distances is not None:
+                distances.update(image, real=False)
             true = truth and truth(view)
             if true is not None:
-                quality.append(_quality(image, to_device(true, device), lpips))
-        return NovelShift(
+                true_views += 1
+                _compare(image, to_device(true, device), quality, perceptual)
+        if true_views:
+            numbers = {metric_id("psnr", region): value for region, value in quality.compute().items()}
+            numbers |= {} if perceptual is None else {"lpips_alex": perceptual.compute()["full"]}
+        found = NovelShift(
             offset=offset,
             views=len(views),
-            distances={} if extractor is None or real is None else _distances(extractor.name, np.stack(features), real),
-            truth=_means(quality),
-            true_views=len(quality),
+            distances={} if distances is None else distances.compute(),
+            truth=numbers,
+            true_views=true_views,
         )
+        for metric in metrics:
+            metric.reset()
+        return found
 
     shifts = tuple(shift(sign * offset) for offset in offsets for sign in (1, -1))
     return NovelRecord(
@@ -92,30 +105,14 @@ def evaluate_novel(
     )
 
 
-def _features(extractor: Extractor, frames: Frames, device: torch.device) -> Float[np.ndarray, "n d"]:
-    return np.stack([extractor(frame.image.to(device).float() / 255) for frame in frames])
-
-
-def _distances(extractor: str, ours: Float[np.ndarray, "n d"], real: Float[np.ndarray, "m d"]) -> dict[str, float]:
-    return {
-        frechet_name(extractor): frechet_distance(ours, real),
-        kernel_name(extractor): kernel_distance(ours, real),
-    }
-
-
-def _quality(image: Float[Tensor, "h w 3"], true: Frame, lpips: Lpips | None) -> dict[str, float]:
-    """PSNR of the whole image, and of the regions that it has; LPIPS of the whole."""
+def _compare(image: Float[Tensor, "h w 3"], true: Frame, quality: Psnr, perceptual: PerceptualDistance | None) -> None:
+    """Add a render and what would have been recorded to the means."""
     target = true.image.float() / 255
-    whole = {"psnr_full": psnr(image, target)} | ({} if lpips is None else {"lpips_alex": lpips(image, target)})
-    regions = {"psnr_human": true.human, "psnr_vehicle": true.vehicle}
-    found = {name: masked_psnr(image, target, mask) for name, mask in regions.items() if mask is not None}
-    return whole | {name: value for name, value in found.items() if value is not None}
-
-
-def _means(quality: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Of each number over the images that have it."""
-    names = dict.fromkeys(name for one in quality for name in one)
-    return {name: fmean(one[name] for one in quality if name in one) for name in names}
+    quality.update(
+        image, target, {name: mask for name in ("human", "vehicle") if (mask := getattr(true, name)) is not None}
+    )
+    if perceptual is not None:
+        perceptual.update(image, target)
 
 
 def shifted_views(views: Sequence[View], offset: float, ramp: bool = False) -> list[View]:

@@ -13,6 +13,7 @@ from sparsestreet.evaluation.evaluate import frame_quality, screen_image
 from sparsestreet.evaluation.predictions import quantized, restored
 from sparsestreet.evaluation.speed import device_name, frame_image
 from sparsestreet.metrics.image import psnr
+from sparsestreet.metrics.reported import reported_metrics
 from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import clock_of
@@ -76,13 +77,14 @@ def _looks(
     """Of each way its quality, rounded as predictions are, and its distance to the exact image, frame by frame."""
     quality: dict[str, list[FrameQuality]] = {name: [] for name in ways}
     distances: dict[str, list[float]] = {name: [] for name in ways}
+    metrics = reported_metrics({})
     for recorded in frames:
         frame = to_device(recorded, scene.device)
         limit = screen_image(scene, frame, exact)
         for name, options in ways.items():
             image = limit if options == exact else screen_image(scene, frame, options)
             shown = torch.from_numpy(restored(quantized(image.cpu().numpy()))).to(scene.device)
-            quality[name].append(frame_quality(shown, frame, {}))
+            quality[name].append(frame_quality(shown, frame, metrics))
             distances[name].append(psnr(image, limit))
     return quality, distances
 

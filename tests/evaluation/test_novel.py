@@ -46,8 +46,8 @@ class MeanDifference(Lpips):
     def __init__(self):
         pass
 
-    def __call__(self, image, truth):
-        return float((image - truth).mean())
+    def layer_maps(self, image, truth):
+        return ((image - truth).mean(-1),)
 
 
 def rig(count):
