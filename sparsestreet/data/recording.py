@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
+from sparsestreet.data.frame_cache import CacheSize, cache_bytes
 from sparsestreet.data.images import check_camera_images, image_notes, joined, read_transparent
-from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.notes import absence_notes
@@ -201,7 +201,7 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
 
     Args:
         recording: what was found.
-        cache_bytes: of decoded frames that are kept in memory; None: as ``KeptFrames`` has it.
+        cache_bytes: of decoded frames that are kept in memory; None: as ``FrameCache`` has it.
         check: finds everything that is wrong with pixels and points; it is asked once something is.
 
     Raises LogError for boxes that cannot be.

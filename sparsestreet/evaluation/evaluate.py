@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, UInt16
 from torch import Tensor
 
 from sparsestreet.data.device import to_device
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.data.lidar import near_returns
 from sparsestreet.evaluation.predictions import Predictions, quantized, restored
 from sparsestreet.metrics.definitions import quantities_of
@@ -65,7 +65,7 @@ def evaluate_frames(
     """
     metrics = reported_metrics(lpips or {})
     if ranks.size > 1:
-        views = frames if isinstance(frames, Frames) else Frames.of(tuple(frames))
+        views = frames if isinstance(frames, Frames) else as_frames(tuple(frames))
         yield from _of_all(scene, views, options, predictions, metrics, ranks)
         return
     for frame in frames:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evaluation.effect_gains import measure_effect_gains
 from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
 from sparsestreet.evaluation.node_costs import measure_scene_costs
@@ -122,7 +122,7 @@ def help_to_evaluate(
 
 
 def _splits(held_out: Frames | tuple[Frame, ...], training: Frames | tuple[Frame, ...]) -> dict[str, Frames]:
-    return {split: Frames.of(frames) for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
+    return {split: as_frames(frames) for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
 
 
 def _looks(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings, make_street
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP
@@ -48,7 +48,7 @@ def written(writer: LogWriter, log: DrivingLog, root: Path) -> Path:
 def with_cameras(log: DrivingLog, **values: object) -> DrivingLog:
     """The log, in memory, with other values of all its cameras."""
     frames = [replace(frame, camera=replace(frame.camera, **values)) for frame in log.frames]
-    return replace(log, frames=Frames.of(frames))
+    return replace(log, frames=as_frames(frames))
 
 
 def matching(log: DrivingLog, back: DrivingLog, names: Mapping[int, str]) -> list[tuple[Frame, Frame]]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log_times import LogTimes, stamps_of_frames
 from sparsestreet.data.roles import role_of
 from sparsestreet.data.vehicle import dataset_from_camera, vehicle_of
@@ -26,7 +26,7 @@ def clocked(**changes):
     stamps = [START + 100_000_000 * view.indices[0] + 30_000_000 * view.indices[1] for view in log.views]
     span = stamps[-1] - stamps[0]
     frames = [replace(one, stamp=at, time=(at - START) / span) for one, at in zip(log.frames, stamps, strict=True)]
-    return replace(log, frames=Frames.of(frames)), stamps
+    return replace(log, frames=as_frames(frames)), stamps
 
 
 def sweep(index: int, time: float, stamp: int | None) -> Sweep:
@@ -45,7 +45,7 @@ def test_stamps_of_normalized_times_are_the_log_s_own():
 
 def test_a_log_of_one_instant_with_a_sweep_of_another():
     log = make_log(num_frames=1, num_cameras=1, sweeps=(sweep(0, 1.0, START + 50),))
-    log = replace(log, frames=Frames.of([replace(log.frames[0], stamp=START, time=0.0)]))
+    log = replace(log, frames=as_frames([replace(log.frames[0], stamp=START, time=0.0)]))
     assert (LogTimes.of(log).first, LogTimes.of(log).span) == (START, 50)
     assert stamps_of_frames(log, LogTimes.of(log)) == (START + 50,)
     alone = replace(log, sweeps=Sweeps.of(()))

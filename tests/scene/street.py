@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.geometry.transforms import inverse
@@ -257,7 +257,7 @@ def street_log(car_points: int = 60) -> DrivingLog:
     )
     return DrivingLog(
         name="hand-made",
-        frames=Frames.of([frame_at(index) for index in frames]),
+        frames=as_frames([frame_at(index) for index in frames]),
         sweeps=Sweeps.of(tuple(sweep_at(index, car_points) for index in frames)),
         tracks=tracks,
         num_frames=NUM_FRAMES,

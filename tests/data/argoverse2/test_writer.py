@@ -10,7 +10,7 @@ import torch
 from omegaconf import OmegaConf
 
 from sparsestreet.data.argoverse2 import Argoverse2Reader, Argoverse2Writer
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.types import Shutter
 from tests.conftest import unchecked
@@ -160,7 +160,7 @@ def test_logs_of_other_rates_keep_their_frames(log, period, tmp_path):
     frames = [replace(one, stamp=period * one.indices[0], time=one.indices[0] / 2) for one in log.frames]
     sweeps = tuple(replace(one, stamp=period * one.index, time=one.index / 2) for one in log.sweeps)
     tracks = tuple(replace(one, times=one.frames.double() / 2) for one in log.tracks)
-    other = replace(log, frames=Frames.of(frames), sweeps=Sweeps.of(sweeps), tracks=tracks)
+    other = replace(log, frames=as_frames(frames), sweeps=Sweeps.of(sweeps), tracks=tracks)
     back = Argoverse2Reader(root=written(EXACT, other, tmp_path)).read()
     assert (back.num_frames, len(back.views)) == (3, 9)
     check_stamps(matching(other, back, NAMES), SECOND)
@@ -171,7 +171,7 @@ def test_logs_of_other_rates_keep_their_frames(log, period, tmp_path):
 
 def test_images_too_far_apart_for_one_sweep_are_counted(log):
     late = [replace(one, stamp=there(one.stamp) + 160_000_000 * (one.indices[1] == 1)) for one in log.frames]
-    said = " | ".join(EXACT.losses(replace(log, frames=Frames.of(late))))
+    said = " | ".join(EXACT.losses(replace(log, frames=as_frames(late))))
     assert "of 9 images are passed over by readers: they are not next to their sweep" in said
 
 

@@ -10,7 +10,7 @@ import torch
 from sparsestreet.data.kitti import KittiReader, KittiWriter
 from sparsestreet.data.kitti.mercator import Mercator
 from sparsestreet.data.kitti.oxts import read_oxts
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.boxes import CarriedPoints, box_at
 from sparsestreet.geometry.transforms import transform_points
@@ -202,7 +202,7 @@ def test_a_log_without_a_clock_and_cameras_beside_each_other(tmp_path):
 
 def with_frame(log: DrivingLog, place: int, frame: Frame | None) -> DrivingLog:
     frames = list(log.frames)
-    return replace(log, frames=Frames.of([*frames[:place], *([] if frame is None else [frame]), *frames[place + 1 :]]))
+    return replace(log, frames=as_frames([*frames[:place], *([] if frame is None else [frame]), *frames[place + 1 :]]))
 
 
 def test_an_image_apart_from_the_rig_is_told(planned):

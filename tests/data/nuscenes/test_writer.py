@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader, NuScenesWriter
 from sparsestreet.types import Shutter
@@ -182,7 +182,7 @@ def test_a_camera_has_one_lens(log):
     frames = list(log.frames)
     frames[4] = replace(frames[4], camera=replace(frames[4].camera, intrinsics=2 * frames[4].camera.intrinsics))
     with pytest.raises(ValueError, match="camera 1 has another lens or size at frame 1"):
-        list(EXACT.files(replace(log, frames=Frames.of(frames))))
+        list(EXACT.files(replace(log, frames=as_frames(frames))))
 
 
 def test_returns_near_the_lidar_are_counted(log):
@@ -205,13 +205,13 @@ def test_a_camera_that_looks_back_gets_rows_of_the_recording_car(log):
             turned.append(replace(frame, camera=replace(frame.camera, camera_from_world=back)))
         else:
             turned.append(frame)
-    losses = EXACT.losses(replace(log, frames=Frames.of(turned)))
+    losses = EXACT.losses(replace(log, frames=as_frames(turned)))
     assert "readers take the lowest rows of CAM_BACK for the recording car's" in losses
 
 
 def test_stamps_are_rounded_to_microseconds(log, tmp_path):
     frames = [replace(frame, stamp=(frame.stamp or 0) + 700 * (frame.indices[1] == 1)) for frame in log.frames]
-    late = replace(log, frames=Frames.of(frames), tracks=())
+    late = replace(log, frames=as_frames(frames), tracks=())
     assert "the stamps of 3 of 9 images are rounded to whole 1000 ns" in EXACT.losses(late)
     back = NuScenesReader(root=written(EXACT, late, tmp_path)).read()
     assert {frame.indices: (frame.stamp or 0) % 1_000_000 for frame in back.frames} == {

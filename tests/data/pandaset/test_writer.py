@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.pandaset import PandaSetReader, PandaSetWriter
 from sparsestreet.data.pandaset.frames import read_columns
@@ -128,7 +128,7 @@ def test_a_sequence_is_as_it_was(tmp_path):
 
 def test_nanoseconds_and_times_before_zero_are_kept(log, tmp_path):
     frames = [replace(frame, stamp=(frame.stamp or 0) + 7) for frame in log.frames]
-    late = replace(log, frames=Frames.of(frames), sweeps=Sweeps.of(()), tracks=())
+    late = replace(log, frames=as_frames(frames), sweeps=Sweeps.of(()), tracks=())
     back = PandaSetReader(root=written(WRITER, late, tmp_path)).read()
     assert back.stamps[0] == -29_999_993
     check_stamps(matching(late, back, NAMES))
@@ -173,7 +173,7 @@ def test_a_log_without_a_clock(tmp_path):
 def test_an_image_that_is_absent_is_an_error(log):
     frames = [frame for frame in log.frames if frame.indices != (1, 2)]
     with pytest.raises(ValueError, match="1 are absent, the first of camera 2 at frame 1: leave such frames"):
-        list(WRITER.files(replace(log, frames=Frames.of(frames))))
+        list(WRITER.files(replace(log, frames=as_frames(frames))))
 
 
 def test_a_sequence_without_its_front_camera_is_an_error(log):
@@ -241,7 +241,7 @@ def test_a_camera_that_looks_back_gets_rows_of_the_recording_car(log):
             turned.append(replace(frame, camera=replace(frame.camera, camera_from_world=back)))
         else:
             turned.append(frame)
-    losses = WRITER.losses(replace(log, frames=Frames.of(turned)))
+    losses = WRITER.losses(replace(log, frames=as_frames(turned)))
     assert "readers take the lowest rows of back_camera for the recording car's" in losses
 
 

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioWriter
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, make_street
 from sparsestreet.data.waymo import WaymoReader
@@ -200,7 +200,7 @@ def test_a_log_without_clock_lidar_and_boxes(writer, tmp_path):
 def test_stamps_before_zero_are_moved_by_whole_seconds(street, tmp_path):
     views = [replace(frame, stamp=there(frame.stamp) - 2_050_000_000) for frame in street.frames]
     sweeps = tuple(replace(sweep, stamp=there(sweep.stamp) - 2_050_000_000) for sweep in street.sweeps)
-    log = replace(street, frames=Frames.of(views), sweeps=Sweeps.of(sweeps))
+    log = replace(street, frames=as_frames(views), sweeps=Sweeps.of(sweeps))
     read = WaymoReader(root=written(WaymoV1Writer(), log, tmp_path)).read()
     assert [view.stamp for view in read.views[::3]] == [950_000_000, 1_050_000_000, 1_150_000_000]
     assert [sweep.stamp for sweep in read.sweeps] == [950_000_000, 1_050_000_000, 1_150_000_000]
@@ -229,7 +229,7 @@ def test_logs_that_no_segment_can_hold(street):
     frames = list(street.frames)
     frames[4] = replace(frames[4], camera=replace(frames[4].camera, intrinsics=frames[4].camera.intrinsics * 2))
     with pytest.raises(ValueError, match="camera 1 of 'street' has images of other sizes, lenses or shutters"):
-        WaymoV1Writer().losses(replace(street, frames=Frames.of(frames)))
+        WaymoV1Writer().losses(replace(street, frames=as_frames(frames)))
 
 
 @pytest.mark.parametrize("direction", ["top", "left", "bottom", "right"])
@@ -237,7 +237,7 @@ def test_shutters_of_all_sides(direction, tmp_path):
     log = make_log(num_frames=2)
     shutter = Shutter(torch.tensor([0.1, 0.2, -0.3]), torch.tensor([0.01, -0.02, 0.03]), direction)
     frames = [replace(one, camera=replace(one.camera, shutter=shutter)) for one in log.frames]
-    log = replace(log, frames=Frames.of(frames))
+    log = replace(log, frames=as_frames(frames))
     for view in WaymoReader(root=written(WaymoV1Writer(), log, tmp_path)).read().views:
         read = there(view.camera.shutter)
         assert read.direction == direction
