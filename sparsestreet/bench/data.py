@@ -15,7 +15,7 @@ from sparsestreet.bench.made_up import MadeUpDrive
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.evaluation.memory import peak_megabytes
+from sparsestreet.evaluation.speed import peak_megabytes
 
 FULL, QUICK = MadeUpDrive(200, 1920, 1280, 150_000), MadeUpDrive(6, 96, 64, 500)
 STEP_MS = 5.0

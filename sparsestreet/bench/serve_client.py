@@ -12,7 +12,7 @@ from typing import Any
 import grpc
 import numpy as np
 
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.edits import objects_of
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.scene.views import FILE_NAME, read_views

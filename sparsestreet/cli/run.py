@@ -15,7 +15,7 @@ from sparsestreet.cli.device import devices_of_job
 from sparsestreet.cli.folder import lies_in, start_of, take_folder
 from sparsestreet.cli.preset import preset_notes
 from sparsestreet.cli.process import follows_another, keep_freed_memory
-from sparsestreet.evaluation.memory import forget_peaks
+from sparsestreet.evaluation.speed import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.run import train
 

@@ -12,7 +12,7 @@ from sparsestreet.data.hood import find_hoods, with_ego
 from sparsestreet.data.log import DrivingLog, Split, split
 from sparsestreet.data.notes import counted
 from sparsestreet.data.reader import LogReader
-from sparsestreet.geometry.displacement import displacement
+from sparsestreet.geometry.boxes import displacement
 
 
 def report_check(

@@ -14,8 +14,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.mask_kinds import find_masks
 from sparsestreet.data.undistortion import Undistortion
 from sparsestreet.data.writer import LogFile
-from sparsestreet.geometry.distortion import largest_shift
-from sparsestreet.geometry.lenses import BrownConrady
+from sparsestreet.geometry.lenses import BrownConrady, largest_shift
 from sparsestreet.types import Camera, Frame
 
 _KINDS = ("sky", "human", "vehicle", "ego")

@@ -11,7 +11,7 @@ from sparsestreet.data.log_times import LogTimes
 from sparsestreet.data.vehicle import dataset_from_camera
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import CarriedPoints, box_at, inside_box
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Sweep, Track, View
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sparsestreet.data.problems import fault
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import rigidity_error
+from sparsestreet.geometry.cameras import rigidity_error
 
 RIGIDITY_TOLERANCE = 1e-4
 """Largest entry of R^T R - I that is let through: it moves a point 100 m away by 5 mm, less than lidar noise, and is a

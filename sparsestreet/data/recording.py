@@ -34,7 +34,7 @@ MASK_KINDS = ("sky", "human", "vehicle", "ego")
 
 
 @dataclass(frozen=True)
-class Shot:
+class RecordedImage:
     """One recorded image."""
 
     frame: int
@@ -98,11 +98,11 @@ class Recording:
 
     name: str
     rig: Sequence[RigCamera]
-    shots: Sequence[Shot]
+    shots: Sequence[RecordedImage]
     """Ordered by (frame, camera); an instant may lack cameras."""
-    read_image: Callable[[Shot], UInt8[Tensor, "h w 3"]]
+    read_image: Callable[[RecordedImage], UInt8[Tensor, "h w 3"]]
     """At the size of the rig's camera. Raises LogError for a broken file."""
-    read_masks: Callable[[Shot], Mapping[str, Bool[Tensor, "h w"]]]
+    read_masks: Callable[[RecordedImage], Mapping[str, Bool[Tensor, "h w"]]]
     """Those of MASK_KINDS that the image has."""
     mask_kinds: frozenset[str] = frozenset()
     """Which kinds the log has at all."""
@@ -323,13 +323,13 @@ def _checked(boxes: Boxes) -> Track:
     return track
 
 
-def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:
+def _view(shot: RecordedImage, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:
     camera = rig[shot.camera].at(recentered(shot.world_from_camera, origin))
     camera = replace(camera, shutter=shot.shutter, exposure=shot.exposure or 0.0)
     return clock.view(camera, shot.frame, shot.camera, shot.stamp)
 
 
-def _frame(recording: Recording, shots: Mapping[tuple[int, int], Shot], view: View) -> Frame:
+def _frame(recording: Recording, shots: Mapping[tuple[int, int], RecordedImage], view: View) -> Frame:
     shot = shots[view.indices]
     masks = dict(recording.read_masks(shot))
     camera = recording.rig[shot.camera]

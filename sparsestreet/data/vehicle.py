@@ -10,7 +10,7 @@ from torch import Tensor
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_times import LogTimes
 from sparsestreet.data.motion import PosePath
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import View
 
 AHEAD_FROM_OPENCV = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)

@@ -15,11 +15,20 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from sparsestreet.metrics.definitions import LPIPS_SIDES
-from sparsestreet.metrics.distances import frechet_distance, frechet_name, kernel_distance, kernel_name
-from sparsestreet.metrics.extractors import Extractor
-from sparsestreet.metrics.image import masked_mse, mse, psnr_of_mse, rounded
+from sparsestreet.metrics.distances import Extractor, frechet_distance, frechet_name, kernel_distance, kernel_name
+from sparsestreet.metrics.image import (
+    GAUSS11,
+    UNIFORM7,
+    Window,
+    masked_mse,
+    masked_ssim_of_map,
+    mse,
+    psnr_of_mse,
+    rounded,
+    ssim_map,
+    ssim_of_map,
+)
 from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
-from sparsestreet.metrics.ssim import GAUSS11, UNIFORM7, Window, masked_ssim_of_map, ssim_map, ssim_of_map
 
 Masks = Mapping[str, Bool[Tensor, "h w"]]
 """Region -> its pixels; the region "full" needs none."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.records.branch_of import BRANCH_OF
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.same_as import SAME_AS

@@ -24,8 +24,7 @@ from sparsestreet.training.lightning import (
     logs_now,
     ranks_of,
 )
-from sparsestreet.training.losses import Loss
-from sparsestreet.training.losses.hood import without_hood
+from sparsestreet.training.losses import Loss, without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.training.quarantine import Quarantine

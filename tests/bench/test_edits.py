@@ -14,7 +14,7 @@ from sparsestreet.data.synthetic.models.car import STYLES, Car
 from sparsestreet.data.synthetic.motion import Path
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.world import Actor, build_world
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.types import Camera, Frame, View
 from tests.export.street import stored_street, street_views

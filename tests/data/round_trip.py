@@ -12,7 +12,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings, make_street
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP
 from sparsestreet.data.writer import LogWriter
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Frame, Track, View
 from tests.conftest import unchecked
 from tests.shared import made_once

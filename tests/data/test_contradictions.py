@@ -12,7 +12,7 @@ from sparsestreet.data.contradictions import contradictions
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Camera, Frame, SparsePoints, Sweep, Track
 from tests.evidence import wall
 

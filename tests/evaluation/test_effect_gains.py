@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import as_frames
-from sparsestreet.evaluation.effect_gains import measure_effect_gains
 from sparsestreet.evaluation.evaluate import evaluate_frames
+from sparsestreet.evaluation.run import measure_effect_gains
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.cli.toy.gain import Gain, GainSettings

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import as_frames
-from sparsestreet.evaluation import novel as novel_module
+from sparsestreet.evaluation import extra as novel_module
 from sparsestreet.evaluation.evaluate import screen_image
-from sparsestreet.evaluation.novel import evaluate_novel, shifted_views
+from sparsestreet.evaluation.extra import evaluate_novel, shifted_views
 from sparsestreet.metrics.distances import frechet_distance, kernel_distance
 from sparsestreet.metrics.lpips import Lpips
 from sparsestreet.records.novel import NOVEL

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import as_frames
-from sparsestreet.evaluation import presets as presets_module
+from sparsestreet.evaluation import extra as presets_module
 from sparsestreet.evaluation.evaluate import evaluate_frames
-from sparsestreet.evaluation.presets import ROUNDS, evaluate_presets
+from sparsestreet.evaluation.extra import ROUNDS, evaluate_presets
 from sparsestreet.ops import SplatSettings
 from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.strict_json import RecordError

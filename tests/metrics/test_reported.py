@@ -13,9 +13,9 @@ from torchmetrics.image import PeakSignalNoiseRatio
 from torchmetrics.image.fid import _compute_fid
 from torchmetrics.image.kid import poly_mmd
 
+from sparsestreet.metrics.image import GAUSS11
 from sparsestreet.metrics.lpips import ALEX, Lpips
 from sparsestreet.metrics.reported import ImageMetric, PerceptualDistance, Psnr, SetDistances, Ssim, reported_metrics
-from sparsestreet.metrics.ssim import GAUSS11
 from tests.metrics.images import image_pair
 from tests.metrics.networks import random_weights
 from tests.training.parallel.several import PATIENCE, several

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.assignment import assign_tracks
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.coverage import Coverage

@@ -10,7 +10,7 @@ import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.data.synthetic.parts import BACKGROUND
-from sparsestreet.geometry.distortion import distort
+from sparsestreet.geometry.lenses import distort
 from sparsestreet.triangulation import ImagePointSettings, street_points
 from sparsestreet.triangulation.features import Features
 from sparsestreet.triangulation.street import _pixel, _rays, _sighting

@@ -25,7 +25,7 @@ from sparsestreet.data.vehicle import Vehicle, vehicle_of
 from sparsestreet.data.writer import LogFile
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import inside_box
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Sweep, View
 
 CAMERAS = {

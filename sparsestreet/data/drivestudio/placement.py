@@ -14,7 +14,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.stamps import frame_stamps
 from sparsestreet.data.vehicle import AHEAD_FROM_OPENCV, dataset_from_camera
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 
 WrittenFlavor = Literal["auto", "waymo", "nuscenes"]
 

@@ -19,8 +19,8 @@ from sparsestreet.data.log_times import LogTimes
 from sparsestreet.data.pinhole_frames import check_every_image, rig_of
 from sparsestreet.data.placed import PlacedLog
 from sparsestreet.data.vehicle import Vehicle, vehicle_of
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.geometry.quaternions import from_matrix, to_rotation_vector
-from sparsestreet.geometry.transforms import inverse, transform_points
 from sparsestreet.types import Sweep, Track, View
 
 EARLIEST = 1_000_000_000

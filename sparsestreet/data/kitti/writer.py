@@ -20,7 +20,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.losses import mask_losses, moved_boxes, object_losses, point_losses
 from sparsestreet.data.pinhole_frames import PinholeFrames, lens_losses
 from sparsestreet.data.writer import LogFile, LogWriter
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 
 _NAME = re.compile(r"\d{4}_\d\d_\d\d_drive_\d{4}")
 _HALF_TURN = 16

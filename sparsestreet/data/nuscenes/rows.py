@@ -18,7 +18,7 @@ from sparsestreet.data.nuscenes.sweeps import OWN_CAR
 from sparsestreet.data.pinhole_frames import rig_of
 from sparsestreet.data.placed import PlacedLog, quaternion
 from sparsestreet.data.vehicle import Vehicle, vehicle_of
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Sweep, Track, View
 
 Rows = list[dict[str, Any]]

@@ -18,7 +18,7 @@ from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR, CAMERAS, FRONT,
 from sparsestreet.data.pandaset.tables import PER_SECOND
 from sparsestreet.data.pinhole_frames import check_every_image, rig_of
 from sparsestreet.data.placed import PlacedLog, quaternion
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Sweep, Track
 
 

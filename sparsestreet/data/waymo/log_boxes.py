@@ -20,7 +20,7 @@ from sparsestreet.data.waymo.lidar import SPIN, crossing
 from sparsestreet.data.waymo.log_segment import LogSegment
 from sparsestreet.data.waymo.segment import CLASSES, BoxLabel, ImageMotion
 from sparsestreet.geometry.boxes import box_at
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Track
 
 KINDS = {"vehicle": 1, "pedestrian": 2, "cyclist": 4}

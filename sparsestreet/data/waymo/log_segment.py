@@ -21,7 +21,7 @@ from sparsestreet.data.waymo.lidar import SPIN
 from sparsestreet.data.waymo.pixels import encode_masks
 from sparsestreet.data.waymo.range_grid import Placed, RangeGrid
 from sparsestreet.data.waymo.segment import CAMERAS, CameraCalibration, ImageMotion, LidarCalibration, canonical
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Camera, Frame, View
 
 READOUT = 44_000_000

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.geometry.distortion import distort, fold_radius_squared
+from sparsestreet.geometry.lenses import distort, fold_radius_squared
 from sparsestreet.types import Camera
 
 Footprint = tuple[Float[Tensor, "v 2"], Float[Tensor, "v 2 k"]]

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import exact_position
-from sparsestreet.geometry.distortion import fold_radius_squared
+from sparsestreet.geometry.lenses import fold_radius_squared
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.ops.reference.footprint import pinhole, unscented
 from sparsestreet.ops.reference.reasons import Reason, first_reason

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sparsestreet.geometry.distortion import distortion_jacobian
+from sparsestreet.geometry.lenses import distortion_jacobian
 from sparsestreet.ops.reference.footprint import Footprint
 from sparsestreet.types import Camera, Gaussians, Shutter
 

@@ -13,7 +13,7 @@ from sparsestreet.data.kitti.oxts import read_oxts
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.boxes import CarriedPoints, box_at
-from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.geometry.cameras import transform_points
 from sparsestreet.types import Frame
 from tests.data.kitti.write import DRIVE, write_kitti
 from tests.data.plan import Plan

@@ -16,7 +16,7 @@ from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR
 from sparsestreet.data.pandaset.pickled import pickled_table
 from sparsestreet.data.pandaset.spin import spin_of
 from sparsestreet.geometry.boxes import CarriedPoints, box_at
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from tests.data.pandaset.write import CAMERAS, PandaPlan, write_sequence
 from tests.data.round_trip import (
     FLOAT32,

@@ -8,7 +8,7 @@ import torch
 
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.effects import MotionBlur, MotionBlurSettings, plan_effects
 from sparsestreet.scene.effects.light import light_of, stored_of
 from sparsestreet.scene.effects.motion_blur import moments_of, num_moments

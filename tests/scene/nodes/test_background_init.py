@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Sweeps, as_frames
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
 from sparsestreet.scene.initialize.sources import LidarPoints, NearPoints
 from sparsestreet.scene.masks import StaticMaskSettings
