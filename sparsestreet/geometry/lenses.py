@@ -112,7 +112,11 @@ def angles_from_axis(directions: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b
 
 
 def sides(directions: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 2"]:
-    """Unit vectors in the image from the center towards each direction; zero on the axis."""
+    """Unit vectors in the image from the center towards each direction; zero on the axis.
+
+    >>> sides(torch.tensor([3.0, 4.0, 7.0], dtype=torch.float64)).tolist()
+    [0.6, 0.8]
+    """
     return torch.nn.functional.normalize(directions[..., :2], dim=-1, eps=1e-300)
 
 
@@ -124,6 +128,11 @@ def _polar(angles: Float64[Tensor, "*#b"], azimuths: Float64[Tensor, "*#b"]) -> 
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Float64[Tensor, "3 3"]:
+    """Return the matrix of a pinhole.
+
+    >>> camera_matrix(100.0, 90.0, 32.0, 24.0).tolist()
+    [[100.0, 0.0, 32.0], [0.0, 90.0, 24.0], [0.0, 0.0, 1.0]]
+    """
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
 
 

@@ -211,12 +211,21 @@ def _rows(state: Any) -> Float[Tensor, "n d"] | Float64[Tensor, "0 0"]:
 def errors_by_region(
     image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks
 ) -> dict[str, float | None]:
-    """Return the mean squared error of the full image and of each mask; None where a mask is empty."""
+    """Return the mean squared error of the full image and of each mask; None where a mask is empty.
+
+    >>> image, mask = torch.full((2, 2, 3), 0.5), torch.zeros(2, 2, dtype=torch.bool)
+    >>> errors_by_region(image, torch.zeros(2, 2, 3), {"human": mask})
+    {'full': 0.25, 'human': None}
+    """
     return {"full": mse(image, truth)} | {region: masked_mse(image, truth, mask) for region, mask in masks.items()}
 
 
 def reported_metrics(lpips: Mapping[str, Lpips], **options: Any) -> dict[str, ImageMetric]:
-    """Return quantity -> metric of what every record holds; ``lpips`` are the networks that there are."""
+    """Return quantity -> metric of what every record holds; ``lpips`` are the networks that there are.
+
+    >>> list(reported_metrics({}))
+    ['psnr8', 'ssim_uniform7', 'ssim_gauss11']
+    """
     return {
         "psnr8": Psnr(eight_bits=True, **options),
         "ssim_uniform7": Ssim(window=UNIFORM7, **options),
