@@ -14,6 +14,17 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
+__all__ = [
+    "Depth",
+    "DynamicRegion",
+    "InverseDepthSmoothness",
+    "Loss",
+    "MaskSparsity",
+    "OpacityEntropy",
+    "Photometric",
+    "SkyMask",
+]
+
 
 @runtime_checkable
 class Loss(Protocol):
