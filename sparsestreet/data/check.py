@@ -8,11 +8,11 @@ from rich.table import Table
 
 from sparsestreet.data.doubts import doubts
 from sparsestreet.data.ego import check_used
-from sparsestreet.data.hood import find_hoods, with_hoods
+from sparsestreet.data.hood import find_hoods, with_ego
 from sparsestreet.data.log import DrivingLog, Split, split
 from sparsestreet.data.notes import counted
 from sparsestreet.data.reader import LogReader
-from sparsestreet.geometry.displacement import displacement
+from sparsestreet.geometry.boxes import displacement
 
 
 def report_check(
@@ -51,7 +51,8 @@ def _report_log(log: DrivingLog, reader: LogReader, console: Console, split_of: 
         console.print(_track_table(log))
     for note in log.notes:
         _line(console, "yellow", "note", note)
-    for doubt in doubts(log, with_hoods(log.frames, find_hoods(log.frames, log.sweeps))):
+    masks = {camera: hood.mask for camera, hood in find_hoods(log.frames, log.sweeps).items()}
+    for doubt in doubts(log, with_ego(log.frames, masks)):
         _line(console, "bold yellow", "doubt", doubt)
     try:
         split_of(log)

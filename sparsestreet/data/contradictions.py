@@ -10,8 +10,7 @@ from torch import Tensor
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.boxes import box_at
-from sparsestreet.geometry.cameras import project
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.types import Camera, Frame, SparsePoints, Track, View
 
 _MIDDLE = 0.25

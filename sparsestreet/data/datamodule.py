@@ -9,12 +9,12 @@ from jaxtyping import Int
 from lightning import LightningDataModule
 from torch import Tensor
 
-from sparsestreet.data.ahead import ReadAhead, read_ahead
 from sparsestreet.data.device import to_device
 from sparsestreet.data.dirt import find_dirt
-from sparsestreet.data.hood import find_hoods, with_hoods
+from sparsestreet.data.frame_cache import Prefetcher, prefetched
+from sparsestreet.data.hood import find_hoods, with_ego
 from sparsestreet.data.lazy import Frames, spread
-from sparsestreet.data.log import DrivingLog, Split, split
+from sparsestreet.data.log import DrivingLog, split
 from sparsestreet.data.recolored import recolored
 from sparsestreet.phases import phase
 from sparsestreet.ranks import ALONE, Ranks
@@ -28,7 +28,7 @@ HOST = torch.device("cpu")
 class ShuffledFrames:
     """All frames in a new random order each epoch, given by seed and epoch alone; endless if asked again and again.
 
-    The order is known ahead, so threads read the next frames while a step computes (``ReadAhead``). An iterator that is
+    Threads read the next frames while a step computes (``Prefetcher``), for the order is known. An iterator that is
     dropped half way is taken up again by the next one. The place is part of checkpoints (Lightning asks for
     ``state_dict``): a resumed training sees the frames that an uninterrupted one would have seen.
     """
@@ -56,7 +56,7 @@ class ShuffledFrames:
             accumulated: frames of a process whose gradients a step takes. What an iterator gives are whole steps, as
                 many as there are frames, so that no step ends with an epoch.
             device: where frames are wanted.
-            threads: as in ``ReadAhead``.
+            threads: as in ``Prefetcher``.
         """
         self.frames = frames
         self._ranks, self._accumulated = ranks, accumulated
@@ -65,7 +65,7 @@ class ShuffledFrames:
         self._finished = finished
         self._with_replacement = with_replacement
         self._orders: dict[int, list[int]] = {}
-        self._ahead = ReadAhead(lambda draw: frames[self._place(draw)], device, threads)
+        self._ahead = Prefetcher(lambda draw: frames[self._place(draw)], device, threads)
 
     def __len__(self) -> int:
         return len(self.frames) * self._accumulated
@@ -128,15 +128,14 @@ class OrderedFrames:
                 processes, each one has all: an iteration of none would be left out.
         """
         places = list(range(len(frames)) if limit is None else spread(len(frames), limit))
-        self.shared = 1 < ranks.size <= len(places)
-        self.frames = frames.at(ranks.share(places) if self.shared else places)
+        self.frames = frames.at(ranks.share(places) if ranks.size <= len(places) else places)
         self._device = device
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def __iter__(self) -> Iterator[Frame]:
-        return read_ahead(self.frames, self._device)
+        return prefetched(self.frames, self._device)
 
 
 class StreetData(LightningDataModule):
@@ -175,15 +174,8 @@ class StreetData(LightningDataModule):
         if val_frames is not None and val_frames < 1:
             raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
         log = log.holding_out(split(log, stride=stride, offset=offset, cameras=cameras).held_out_indices)
+        log = _masked(log, split(log, stride=stride, offset=offset, cameras=cameras).train, hood, dirt)
         self.split = split(log, stride=stride, offset=offset, cameras=cameras)
-        if hood is not None and (hoods := find_hoods(self.split.train, log.sweeps)):
-            seen = {camera: found for camera, found in hoods.items() if found.share >= hood}
-            log = replace(log, frames=with_hoods(log.frames, seen), hoods=hoods)
-            self.split = Split(with_hoods(self.split.train, seen), with_hoods(self.split.held_out, seen))
-        if dirt is not None and (spots := find_dirt(self.split.train, log.sweeps, log.tracks)):
-            seen = {camera: found for camera, found in spots.items() if float(found.mask.float().mean()) >= dirt}
-            log = replace(log, frames=with_hoods(log.frames, seen), dirt=spots)
-            self.split = Split(with_hoods(self.split.train, seen), with_hoods(self.split.held_out, seen))
         # Colors of a sweep are those of images, so a camera that is held out gives none.
         self.driving_log = replace(log, sweeps=recolored(log, self.split)) if cameras else log
         instants = [f"every {stride}th frame from {offset}"] if stride else []
@@ -197,7 +189,6 @@ class StreetData(LightningDataModule):
 
     def train_dataloader(self) -> ShuffledFrames:
         """One training frame a step; an epoch is all of them in random order."""
-        trainer = self.trainer
         trainer = self.trainer
         if self.split.train.forecast is not None:
             logger.info("%s", self.split.train.forecast())
@@ -242,3 +233,14 @@ class StreetData(LightningDataModule):
         """The frame on the device (Lightning itself cannot move a frozen dataclass)."""
         with phase("data"):
             return to_device(batch, device)
+
+
+def _masked(log: DrivingLog, train: Frames, hood: float | None, dirt: float | None) -> DrivingLog:
+    """Return the log whose frames have in ``ego`` what training frames show of hoods and dirt, from these shares on."""
+    hoods = {} if hood is None else find_hoods(train, log.sweeps)
+    hidden = {camera: found.mask for camera, found in hoods.items() if hood is not None and found.share >= hood}
+    spots = {} if dirt is None else find_dirt(with_ego(train, hidden), log.sweeps, log.tracks)
+    for camera, found in spots.items():
+        if dirt is not None and float(found.mask.float().mean()) >= dirt:
+            hidden[camera] = found.mask | hidden[camera] if camera in hidden else found.mask
+    return replace(log, frames=with_ego(log.frames, hidden), hoods=hoods or log.hoods, dirt=spots or log.dirt)

@@ -9,8 +9,7 @@ from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, Sweeps, spread
 from sparsestreet.geometry.boxes import box_at, inside_box
-from sparsestreet.geometry.cameras import project
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.types import Frame, Sweep, Track, View
 
 Pixels = tuple[Int[Tensor, " n"], Int[Tensor, " n"]]

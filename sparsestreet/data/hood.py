@@ -1,5 +1,6 @@
 """The recording car in its own images, found where nobody declares it: rows at the bottom that never change."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,9 +135,9 @@ def _followed(
     return torch.cat(moved), torch.cat(stayed), torch.cat(columns)
 
 
-def with_hoods(frames: Frames, hoods: dict[int, Hood]) -> Frames:
-    """The frames with the hoods among their ``ego`` pixels; they are read as before, when they are indexed."""
-    seen = {camera: hood.mask for camera, hood in hoods.items() if hood.mask.any()}
+def with_ego(frames: Frames, masks: Mapping[int, Bool[Tensor, "h w"]]) -> Frames:
+    """Return frames that have each camera's mask among their ``ego`` pixels; nothing is read before it is indexed."""
+    seen = {camera: mask for camera, mask in masks.items() if mask.any()}
     if not seen:
         return frames
 

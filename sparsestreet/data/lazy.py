@@ -1,15 +1,10 @@
-"""Sequences whose items are read when they are asked for, and the memory that they may keep."""
+"""Sequences whose items are read when they are asked for."""
 
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
-from typing import Any, Generic, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
-from sparsestreet.data.kept_frames import MemoryForecast
-from sparsestreet.data.lock import Lock
+from sparsestreet.data.frame_cache import MemoryForecast
 from sparsestreet.types import Frame, Sweep, View
-
-K = TypeVar("K", bound=Hashable)
-T = TypeVar("T")
 
 
 def spread(count: int, limit: int) -> list[int]:
@@ -70,11 +65,6 @@ class Frames(LazySequence):
         super().__init__(keys, load)
         self.forecast = forecast
 
-    @classmethod
-    def of(cls, frames: "Frames | Sequence[Frame]") -> "Frames":
-        """Frames in memory as such a sequence; one that is one already as it is."""
-        return frames if isinstance(frames, Frames) else cls(frames, lambda frame: frame)
-
     @property
     def views(self) -> tuple[View, ...]:
         """Cameras, times and indices of all frames."""
@@ -82,6 +72,11 @@ class Frames(LazySequence):
 
     def _of(self, keys: Iterable[Any]) -> "Frames":
         return type(self)(keys, self.load, self.forecast)
+
+
+def as_frames(frames: Frames | Sequence[Frame]) -> Frames:
+    """Return frames in memory as a lazy sequence; one that is lazy already as it is."""
+    return frames if isinstance(frames, Frames) else Frames(frames, lambda frame: frame)
 
 
 class Sweeps(LazySequence):
@@ -124,39 +119,3 @@ class Sweeps(LazySequence):
 
     def _of(self, keys: Iterable[int]) -> "Sweeps":
         return Sweeps(keys, self.load, self.load_gray, self.stamps)
-
-
-class RecentlyUsed(Generic[K, T]):
-    """What ``load`` makes of a key, remembered while there is room; what was not used for longest makes way.
-
-    Threads may ask at the same time; each then loads what none remembers yet.
-    """
-
-    def __init__(self, load: Callable[[K], T], size: Callable[[T], int], room: int) -> None:
-        """``room`` is in the unit of ``size``; a value that is larger on its own is not remembered."""
-        self._load = load
-        self._size = size
-        self._room = room
-        self._held: OrderedDict[K, T] = OrderedDict()
-        self._used = 0
-        self._lock = Lock()
-
-    def __call__(self, key: K) -> T:
-        with self._lock:
-            if key in self._held:
-                self._held.move_to_end(key)
-                return self._held[key]
-        value = self._load(key)
-        size = self._size(value)
-        if size <= self._room:
-            with self._lock:
-                self._hold(key, value, size)
-        return value
-
-    def _hold(self, key: K, value: T, size: int) -> None:
-        if key in self._held:  # another thread was faster
-            return
-        self._held[key] = value
-        self._used += size
-        while self._used > self._room:
-            self._used -= self._size(self._held.popitem(last=False)[1])

@@ -11,7 +11,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.hood import Hood
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.notes import counted
 from sparsestreet.data.tracks import repeated
 from sparsestreet.geometry.trajectories import frame_periods
@@ -234,7 +234,7 @@ def split(log: DrivingLog, *, stride: int = 10, offset: int = 5, cameras: Sequen
         trained = {view.indices for view in parts.train.views}
         return Split(parts.train, log.frames.where(lambda view: view.indices not in trained))
     if stride == 0:
-        return Split(log.frames, Frames.of(()))
+        return Split(log.frames, as_frames(()))
     if not 0 <= offset <= stride:
         raise ValueError(
             f"a split needs 0 <= offset <= stride, got split.offset {offset} and split.stride {stride}: offset is the "

@@ -8,7 +8,7 @@ from jaxtyping import Float, Float32, Float64, Int64
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 
 _POINTS_AT_ONCE = 16_384
 """A pose for each point takes 128 bytes; these stay in the processor's cache."""

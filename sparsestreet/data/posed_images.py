@@ -21,7 +21,7 @@ from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import check_camera_images, check_image_sizes, read_image, read_mask
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import Problem, attempt, fault, missing_files, missing_notes
-from sparsestreet.data.recording import RecordedReader, Recording, Shot
+from sparsestreet.data.recording import RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.window import chosen_cameras, frame_window
 from sparsestreet.geometry.lenses import Lens
@@ -158,7 +158,7 @@ def recording_of(
         for index, (name, (lens, size)) in enumerate(images.cameras.items())
     ]
     shots = [
-        Shot(frame, camera.index, _scaled(image.world_from_camera, scale), image, image.path.stem)
+        RecordedImage(frame, camera.index, _scaled(image.world_from_camera, scale), image, image.path.stem)
         for frame, instant in enumerate(images.instants)
         for camera in rig
         if (image := instant.get(camera.name)) is not None
@@ -212,12 +212,14 @@ def _camera_names(images: Sequence[PosedImage]) -> dict[tuple[str, Lens, tuple[i
     return named
 
 
-def _image(rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
+def _image(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
     camera = rig[shot.camera]
     return read_image(_posed(shot).path, camera.size, camera.undistortion)
 
 
-def _masks(rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: Shot) -> dict[str, Bool[Tensor, "h w"]]:
+def _masks(
+    rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: RecordedImage
+) -> dict[str, Bool[Tensor, "h w"]]:
     """Those that the data set and the user have; what either excludes is excluded."""
     camera, image = rig[shot.camera], _posed(shot)
     masks: dict[str, Bool[Tensor, "h w"]] = {}
@@ -232,7 +234,7 @@ def _masks(rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: Shot) 
     return masks
 
 
-def _posed(shot: Shot) -> PosedImage:
+def _posed(shot: RecordedImage) -> PosedImage:
     assert isinstance(shot.key, PosedImage)
     return shot.key
 
@@ -248,7 +250,7 @@ def _scaled_points(read: SparsePointsReader, scale: float) -> tuple[Float64[Tens
     return scale * positions, colors
 
 
-def _note_of_scale(shots: Sequence[Shot], scale: float) -> str:
+def _note_of_scale(shots: Sequence[RecordedImage], scale: float) -> str:
     first = [shot.world_from_camera[:3, 3] for shot in shots if shot.camera == shots[0].camera]
     length = float((torch.stack(first[1:]) - torch.stack(first[:-1])).norm(dim=-1).sum()) if len(first) > 1 else 0.0
     return (

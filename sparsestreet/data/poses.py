@@ -8,7 +8,7 @@ from torch import Tensor
 
 from sparsestreet.data.problems import fault
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import rigidity_error
+from sparsestreet.geometry.cameras import rigidity_error
 
 AHEAD_FROM_OPENCV = torch.tensor([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=torch.float64)
 """Axes x ahead, y left, z up, which Waymo's cameras have too, from OpenCV's."""

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
+from sparsestreet.data.frame_cache import CacheSize, cache_bytes
 from sparsestreet.data.images import check_camera_images, image_notes, joined, read_transparent
-from sparsestreet.data.kept_frames import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.notes import absence_notes
@@ -34,7 +34,7 @@ MASK_KINDS = ("sky", "human", "vehicle", "ego")
 
 
 @dataclass(frozen=True)
-class Shot:
+class RecordedImage:
     """One recorded image."""
 
     frame: int
@@ -98,11 +98,11 @@ class Recording:
 
     name: str
     rig: Sequence[RigCamera]
-    shots: Sequence[Shot]
+    shots: Sequence[RecordedImage]
     """Ordered by (frame, camera); an instant may lack cameras."""
-    read_image: Callable[[Shot], UInt8[Tensor, "h w 3"]]
+    read_image: Callable[[RecordedImage], UInt8[Tensor, "h w 3"]]
     """At the size of the rig's camera. Raises LogError for a broken file."""
-    read_masks: Callable[[Shot], Mapping[str, Bool[Tensor, "h w"]]]
+    read_masks: Callable[[RecordedImage], Mapping[str, Bool[Tensor, "h w"]]]
     """Those of MASK_KINDS that the image has."""
     mask_kinds: frozenset[str] = frozenset()
     """Which kinds the log has at all."""
@@ -201,7 +201,7 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
 
     Args:
         recording: what was found.
-        cache_bytes: of decoded frames that are kept in memory; None: as ``KeptFrames`` has it.
+        cache_bytes: of decoded frames that are kept in memory; None: as ``FrameCache`` has it.
         check: finds everything that is wrong with pixels and points; it is asked once something is.
 
     Raises LogError for boxes that cannot be.
@@ -323,13 +323,13 @@ def _checked(boxes: Boxes) -> Track:
     return track
 
 
-def _view(shot: Shot, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:
+def _view(shot: RecordedImage, rig: Sequence[RigCamera], origin: Float64[Tensor, "3"], clock: LogClock) -> View:
     camera = rig[shot.camera].at(recentered(shot.world_from_camera, origin))
     camera = replace(camera, shutter=shot.shutter, exposure=shot.exposure or 0.0)
     return clock.view(camera, shot.frame, shot.camera, shot.stamp)
 
 
-def _frame(recording: Recording, shots: Mapping[tuple[int, int], Shot], view: View) -> Frame:
+def _frame(recording: Recording, shots: Mapping[tuple[int, int], RecordedImage], view: View) -> Frame:
     shot = shots[view.indices]
     masks = dict(recording.read_masks(shot))
     camera = recording.rig[shot.camera]

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from sparsestreet.data.problems import fault
 from sparsestreet.data.undistortion import Undistortion
-from sparsestreet.geometry.distortion import largest_shift
-from sparsestreet.geometry.lenses import BrownConrady, Lens
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
+from sparsestreet.geometry.lenses import BrownConrady, Lens, largest_shift
 from sparsestreet.types import Camera
 
 Name = TypeVar("Name", str, int)

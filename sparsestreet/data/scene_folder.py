@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.data.clock import LogClock
-from sparsestreet.data.kept_frames import KeptFrames, MemoryForecast
-from sparsestreet.data.lazy import Frames, RecentlyUsed, Sweeps
+from sparsestreet.data.frame_cache import FrameCache, LruCache, MemoryForecast
+from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
 from sparsestreet.data.problems import LogError, Problem
 from sparsestreet.geometry.boxes import CarriedPoints, without_frames
@@ -45,7 +45,7 @@ class SceneFolder:
             read_frame: decodes the image and the masks of a view; depth is added here.
             read_points: lidar points of a frame index in the log's world; None: the log has no lidar.
             clock: of the log.
-            cache_bytes: of decoded frames that are kept in memory; None: as ``KeptFrames`` has it.
+            cache_bytes: of decoded frames that are kept in memory; None: as ``FrameCache`` has it.
             check: finds everything that is wrong with the folder; it is asked once something is.
             tracks: objects that carry points, with the times of their boxes.
             sweep_stamps: frame index -> stamp of its sweep, where that is not the frame's.
@@ -65,10 +65,10 @@ class SceneFolder:
     def _use(self, others: Sequence[Track], held_out: frozenset[int]) -> None:
         """Sets the objects that carry points of frames which are not held out, and forgets what others carried."""
         self._others, self._held_out = tuple(others), held_out
-        self._frames = KeptFrames(self._read_frame, self._cache_bytes)
+        self._frames = FrameCache(self._read_frame, self._cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.
         read = self._read_points
-        self._points = None if read is None else RecentlyUsed(self._carried(read), lambda points: 1, 1)
+        self._points = None if read is None else LruCache(self._carried(read), lambda points: 1, 1)
 
     def holding_out(self, frames: frozenset[int]) -> tuple[Frames, Sweeps]:
         """Frames and sweeps, of which those of other instants depend on no box of these frames."""

@@ -1,25 +1,89 @@
 """Renders against recorded images, one at a time: nothing is kept but numbers, and predictions on disk."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt16
 from torch import Tensor
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.data.device import to_device
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.data.lidar import near_returns
-from sparsestreet.evaluation.predictions import Predictions, quantized, restored
-from sparsestreet.metrics import image as metrics
-from sparsestreet.metrics import ssim
-from sparsestreet.metrics.definitions import GAUSS_WINDOW, LPIPS_SIDES, quantities_of
-from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
+from sparsestreet.metrics.definitions import quantities_of
+from sparsestreet.metrics.image import psnr_of_mse
+from sparsestreet.metrics.lpips import Lpips
+from sparsestreet.metrics.reported import ImageMetric, errors_by_region, reported_metrics
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.quality import FrameQuality, RegionQuality
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import Frame, View
+
+LEVELS = 65535
+
+
+class PredictionError(ValueError):
+    """A stored prediction that cannot be read; names the file and the remedy."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """The predictions of some views, one file each."""
+
+    folder: Path
+
+    @classmethod
+    def of(cls, run: Path, split: str) -> "Predictions":
+        """Those that a run keeps of the views of a split."""
+        return cls(run / "predictions" / split)
+
+    def path(self, frame: int, camera: int) -> Path:
+        """The file of one view."""
+        return self.folder / f"{frame:03d}_{camera}.png"
+
+    def clear(self) -> None:
+        """Remove those of an earlier evaluation, perhaps of other views; files of other names stay."""
+        for path in self.folder.glob("[0-9]*_[0-9]*.png"):
+            path.unlink()
+
+    def write(self, frame: int, camera: int, pixels: UInt16[np.ndarray, "h w 3"]) -> None:
+        """Write one, the whole file or nothing. Raises OSError where it cannot be written."""
+        path = self.path(frame, camera)
+        with atomic_file(path) as temporary:
+            # OpenCV's order is BGR. Of 16 bits the lower are noise, which no effort compresses.
+            done, data = cv2.imencode(".png", pixels[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+            if not done:
+                raise OSError(f"{path}: an image of shape {pixels.shape} cannot be encoded as PNG")
+            temporary.write_bytes(data.tobytes())
+
+    def read(self, frame: int, camera: int) -> UInt16[np.ndarray, "h w 3"]:
+        """Read one back. Raises PredictionError for a file that is absent, damaged or no 16-bit RGB PNG."""
+        path = self.path(frame, camera)
+        if not path.is_file():
+            raise PredictionError(f"{path} is not there: evaluate the run, which stores its predictions")
+        try:
+            pixels = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:  # an empty file, or a header of more pixels than OpenCV reads
+            pixels = None
+        if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
+            found = "cannot be decoded" if pixels is None else f"is {pixels.dtype} of shape {pixels.shape}"
+            raise PredictionError(f"{path} {found}, a prediction is a 16-bit RGB PNG: evaluate the run again")
+        return np.ascontiguousarray(pixels[..., ::-1])
+
+
+def quantized(image: Float[np.ndarray, "h w 3"]) -> UInt16[np.ndarray, "h w 3"]:
+    """Values in [0, 1] as a prediction holds them."""
+    return np.round(image.astype(np.float64) * LEVELS).astype(np.uint16)
+
+
+def restored(pixels: UInt16[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """What a prediction holds as float32 in [0, 1]."""
+    return (pixels / LEVELS).astype(np.float32)
 
 
 @torch.no_grad()
@@ -63,16 +127,17 @@ def evaluate_frames(
     Raises ValueError for a render that is not finite (in all processes), OSError where a prediction cannot be written,
     LostProcessError.
     """
+    metrics = reported_metrics(lpips or {})
     if ranks.size > 1:
-        views = frames if isinstance(frames, Frames) else Frames.of(tuple(frames))
-        yield from _of_all(scene, views, options, predictions, lpips, ranks)
+        views = frames if isinstance(frames, Frames) else as_frames(tuple(frames))
+        yield from _of_all(scene, views, options, predictions, metrics, ranks)
         return
     for frame in frames:
         pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         if predictions is not None:
             predictions.write(*frame.indices, pixels)
             pixels = predictions.read(*frame.indices)
-        yield _quality(pixels, frame, scene.device, lpips)
+        yield _quality(pixels, frame, scene.device, metrics)
 
 
 def _of_all(
@@ -80,7 +145,7 @@ def _of_all(
     frames: Frames,
     options: RenderOptions,
     predictions: Predictions | None,
-    lpips: Mapping[str, Lpips] | None,
+    metrics: Mapping[str, ImageMetric],
     ranks: Ranks,
 ) -> Iterator[FrameQuality]:
     """A round takes a frame of each process, whose pixels travel to the first: only its disk need hold the run."""
@@ -93,7 +158,7 @@ def _of_all(
             pixels = quantized(screen_image(scene, frame, options).cpu().numpy())
         except ValueError as error:
             return error
-        return (None if predictions is None else pixels), _quality(pixels, frame, scene.device, lpips)
+        return (None if predictions is None else pixels), _quality(pixels, frame, scene.device, metrics)
 
     for first in range(0, len(frames), ranks.size):
         for found in ranks.gathered(look(first + ranks.rank)):
@@ -117,24 +182,33 @@ def evaluate_predictions(
 
     Raises PredictionError for a prediction that is absent or damaged.
     """
+    metrics = reported_metrics(lpips or {})
     for frame in frames:
         pixels = predictions.read(*frame.indices)
-        yield _quality(pixels, frame, device, lpips)
+        yield _quality(pixels, frame, device, metrics)
 
 
 def _quality(
-    pixels: UInt16[np.ndarray, "h w 3"], frame: Frame, device: torch.device, lpips: Mapping[str, Lpips] | None
+    pixels: UInt16[np.ndarray, "h w 3"], frame: Frame, device: torch.device, metrics: Mapping[str, ImageMetric]
 ) -> FrameQuality:
-    return frame_quality(torch.from_numpy(restored(pixels)).to(device), to_device(frame, device), lpips or {})
+    return frame_quality(torch.from_numpy(restored(pixels)).to(device), to_device(frame, device), metrics)
 
 
 @torch.no_grad()
-def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame, lpips: Mapping[str, Lpips]) -> FrameQuality:
+def frame_quality(rgb: Float[Tensor, "h w 3"], frame: Frame, metrics: Mapping[str, ImageMetric]) -> FrameQuality:
     """Compare one clamped render [0, 1] with the frame's image, in full and by region; both on one device."""
-    height, width = frame.image.shape[:2]
-    measured = _Measured(rgb, frame.image.float() / 255, lpips)
-    regions = {name: measured.within(name, mask) for name, mask in region_masks(frame).items()}
-    return FrameQuality(*frame.indices, width, height, {"full": measured.whole()} | regions)
+    truth, masks = frame.image.float() / 255, region_masks(frame)
+    errors = errors_by_region(rgb, truth, masks)
+    values = {name: metric.measure(rgb, truth, masks) for name, metric in metrics.items()}
+    values["mse"] = errors
+    values["psnr"] = {region: None if error is None else psnr_of_mse(error) for region, error in errors.items()}
+    height, width = truth.shape[:2]
+    pixels = {"full": height * width} | {region: int(mask.sum()) for region, mask in masks.items()}
+    regions = {
+        region: RegionQuality(count, **{name: values[name][region] for name in quantities_of(region) if name in values})
+        for region, count in pixels.items()
+    }
+    return FrameQuality(*frame.indices, width, height, regions)
 
 
 def region_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
@@ -159,37 +233,3 @@ def lidar_masks(frame: Frame) -> dict[str, Bool[Tensor, "h w"]]:
     for mask in (frame.sky, frame.ego):
         ground = ground if mask is None else ground & ~mask
     return {"near_lidar": near & ground, "beyond_lidar": ~near & ground}
-
-
-class _Measured:
-    """One pair of images with what all regions share: the render in 8 bits, and maps of similarity and distance."""
-
-    def __init__(self, rgb: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], lpips: Mapping[str, Lpips]) -> None:
-        self.rgb, self.truth, self.rgb8 = rgb, truth, metrics.rounded(rgb)
-        shorter = min(rgb.shape[:2])
-        self.windows = {"ssim_uniform7": ssim.UNIFORM7}
-        if shorter >= GAUSS_WINDOW:
-            self.windows["ssim_gauss11"] = ssim.GAUSS11
-        self.maps = {name: ssim.ssim_map(rgb, truth, window) for name, window in self.windows.items()}
-        self.layers = {name: one.layer_maps(rgb, truth) for name, one in lpips.items() if shorter >= LPIPS_SIDES[name]}
-
-    def whole(self) -> RegionQuality:
-        error = metrics.mse(self.rgb, self.truth)
-        return RegionQuality(
-            pixels=self.rgb.shape[0] * self.rgb.shape[1],
-            mse=error,
-            psnr=metrics.psnr_of_mse(error),
-            psnr8=metrics.psnr(self.rgb8, self.truth),
-            **{name: ssim.ssim_of_map(self.maps[name], window) for name, window in self.windows.items()},
-            **{name: lpips_of_layers(layers) for name, layers in self.layers.items()},
-        )
-
-    def within(self, region: str, mask: Bool[Tensor, "h w"]) -> RegionQuality:
-        error = metrics.masked_mse(self.rgb, self.truth, mask)
-        if error is None:
-            return RegionQuality(0, None, None, None)
-        values: dict[str, float | None] = {"mse": error, "psnr": metrics.psnr_of_mse(error)}
-        values["psnr8"] = metrics.masked_psnr(self.rgb8, self.truth, mask)
-        values |= {name: ssim.masked_ssim_of_map(one, mask) for name, one in self.maps.items()}
-        values |= {name: masked_lpips_of_layers(layers, mask) for name, layers in self.layers.items()}
-        return RegionQuality(int(mask.sum()), **{name: values.get(name) for name in quantities_of(region)})

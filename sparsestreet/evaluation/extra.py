@@ -1,23 +1,233 @@
 """What is measured of a finished scene where somebody asks: beside the recorded path, and rendered in other ways."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+import math
+import statistics
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.device import to_device
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Truth
-from sparsestreet.evaluation.novel import evaluate_novel
-from sparsestreet.evaluation.presets import evaluate_presets
-from sparsestreet.evaluation.speed import Timing
-from sparsestreet.metrics.extractors import LastLayer
-from sparsestreet.metrics.lpips_weights import open_lpips
+from sparsestreet.evaluation.evaluate import frame_quality, quantized, restored, screen_image
+from sparsestreet.evaluation.speed import Timing, device_name, frame_image
+from sparsestreet.geometry.cameras import moved
+from sparsestreet.metrics.definitions import metric_id
+from sparsestreet.metrics.distances import Extractor, LastLayer
+from sparsestreet.metrics.image import psnr
+from sparsestreet.metrics.lpips import Lpips, open_lpips
+from sparsestreet.metrics.reported import PerceptualDistance, Psnr, SetDistances, reported_metrics
+from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
-from sparsestreet.phases import stage
-from sparsestreet.records.novel import NOVEL, NovelRecord
-from sparsestreet.records.presets import PRESETS, PresetRecord
+from sparsestreet.phases import clock_of, stage
+from sparsestreet.records.novel import NOVEL, NovelRecord, NovelShift
+from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
+from sparsestreet.records.quality import FrameQuality, summarize
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.types import Frame, View
+
+
+@torch.no_grad()
+def evaluate_novel(
+    scene: SceneGraph,
+    frames: Frames,
+    offsets: Sequence[float],
+    options: RenderOptions,
+    *,
+    command: str,
+    truth: Truth | None,
+    extractor: Extractor | None,
+    lpips: Lpips | None = None,
+    absent: str = "",
+    ramp: bool = False,
+) -> NovelRecord:
+    """Shift recorded views by each offset to both sides, and compare.
+
+    Args:
+        scene: on the device where it renders.
+        frames: recorded views, best those that training did not see; one image at a time is in memory.
+        offsets: meters, above 0.
+        options: how the scene is rendered.
+        command: that asked for it.
+        truth: what a view would have recorded; None: nobody knows.
+        extractor: of the features that distances compare; None: no distances.
+        lpips: compares renders with true images; None: PSNR alone does.
+        absent: why there is no extractor.
+        ramp: as in ``NovelRecord``.
+
+    Raises ValueError without views, for offsets that are not above 0, or for renders that are not finite.
+    """
+    if not frames or not offsets or not min(offsets) > 0:
+        raise ValueError(f"novel views need recorded ones and offsets above 0 m, got {len(frames)} and {list(offsets)}")
+    if len(frames) < 2:
+        extractor, absent = None, "distances need at least two images: hold out more views"
+    device = scene.device
+    # One process measures: the others wait for nobody.
+    distances = None if extractor is None else SetDistances(extractor, sync_on_compute=False)
+    quality = Psnr(("full", "human", "vehicle"), sync_on_compute=False)
+    perceptual = None if lpips is None else PerceptualDistance(lpips, sync_on_compute=False)
+    metrics = [metric for metric in (quality, perceptual, distances) if metric is not None]
+    if distances is not None:
+        for frame in frames:
+            distances.update(frame.image.to(device).float() / 255, real=True)
+
+    def shift(offset: float) -> NovelShift:
+        views = shifted_views(frames.views, offset, ramp)
+        true_views, numbers = 0, {}
+        for view in views:
+            image = screen_image(scene, view, options)
+            if distances is not None:
+                distances.update(image, real=False)
+            true = truth and truth(view)
+            if true is not None:
+                true_views += 1
+                _compare(image, to_device(true, device), quality, perceptual)
+        if true_views:
+            numbers = {metric_id("psnr", region): value for region, value in quality.compute().items()}
+            numbers |= {} if perceptual is None else {"lpips_alex": perceptual.compute()["full"]}
+        found = NovelShift(
+            offset=offset,
+            views=len(views),
+            distances={} if distances is None else distances.compute(),
+            truth=numbers,
+            true_views=true_views,
+        )
+        for metric in metrics:
+            metric.reset()
+        return found
+
+    shifts = tuple(shift(sign * offset) for offset in offsets for sign in (1, -1))
+    return NovelRecord(
+        command=command,
+        ramp=ramp,
+        real_views=len(frames),
+        absent=None if extractor is not None else absent,
+        shifts=shifts,
+    )
+
+
+def _compare(image: Float[Tensor, "h w 3"], true: Frame, quality: Psnr, perceptual: PerceptualDistance | None) -> None:
+    """Add a render and what would have been recorded to the means."""
+    target = true.image.float() / 255
+    quality.update(
+        image, target, {name: mask for name in ("human", "vehicle") if (mask := getattr(true, name)) is not None}
+    )
+    if perceptual is not None:
+        perceptual.update(image, target)
+
+
+def shifted_views(views: Sequence[View], offset: float, ramp: bool = False) -> list[View]:
+    """Views moved sideways, all cameras of an instant as one, meters to the right of the camera of the lowest index.
+
+    They keep time and camera, but lose their frame index: nobody recorded them.
+    """
+    instants = sorted({view.indices[0] for view in views})
+    steps = np.linspace(0, 1, len(instants)) if ramp and len(instants) > 1 else np.ones(len(instants))
+    shares = dict(zip(instants, steps.tolist(), strict=True))
+    fronts: dict[int, View] = {}
+    for view in sorted(views, key=lambda view: view.indices[1]):
+        fronts.setdefault(view.indices[0], view)
+    found = []
+    for view in views:
+        instant, _ = view.indices
+        right = fronts[instant].camera.camera_from_world[0, :3].double()
+        camera = moved(view.camera, shares[instant] * offset * right)
+        found.append(replace(view, camera=camera, frame_index=None))
+    return found
+
+
+ROUNDS = 4
+"""Over all views, in which every preset is timed once a view."""
+SLOW_MS = 200.0
+"""A preset whose frames take longer is timed in the first round alone."""
+
+
+@torch.no_grad()
+def evaluate_presets(
+    scene: SceneGraph, frames: Frames, presets: Mapping[str, RenderOptions], trained: RenderOptions, *, command: str
+) -> PresetRecord:
+    """Quality, distance to the exact image and milliseconds of each way to render, over the same views.
+
+    Args:
+        scene: on the device where it renders; stays as it is.
+        frames: recorded views, best those that training did not see; one image at a time is in memory.
+        presets: name -> how to render.
+        trained: how the scene was rendered in training; its backend renders all presets.
+        command: that asked for it.
+
+    Raises ValueError without views or presets, or for renders that are not finite.
+    """
+    if not frames or not presets:
+        raise ValueError(f"give views and at least one preset, got {len(frames)} and {list(presets)}")
+    before = calibrate(scene.device)
+    ways = {name: replace(options, backend=trained.backend) for name, options in presets.items()}
+    quality, distances = _looks(scene, frames, ways, replace(trained, settings=_exact(trained.settings)))
+    times = _frame_times(scene, frames.views, ways)
+    rendered = tuple(
+        RenderedAs(
+            preset=name,
+            trained=options == trained,
+            quality={metric: one.mean for metric, one in summarize(quality[name]).items() if one.mean is not None},
+            psnr_to_exact=statistics.fmean(distances[name]),
+            frame_ms=statistics.median(times[name]),
+            repeats=len(times[name]),
+        )
+        for name, options in ways.items()
+    )
+    return PresetRecord(
+        command=command,
+        device=device_name(scene.device),
+        threads=torch.get_num_threads(),
+        views=len(frames),
+        noise=noise_between(before, calibrate(scene.device)),
+        rendered=rendered,
+    )
+
+
+def _looks(
+    scene: SceneGraph, frames: Frames, ways: Mapping[str, RenderOptions], exact: RenderOptions
+) -> tuple[dict[str, list[FrameQuality]], dict[str, list[float]]]:
+    """Of each way its quality, rounded as predictions are, and its distance to the exact image, frame by frame."""
+    quality: dict[str, list[FrameQuality]] = {name: [] for name in ways}
+    distances: dict[str, list[float]] = {name: [] for name in ways}
+    metrics = reported_metrics({})
+    for recorded in frames:
+        frame = to_device(recorded, scene.device)
+        limit = screen_image(scene, frame, exact)
+        for name, options in ways.items():
+            image = limit if options == exact else screen_image(scene, frame, options)
+            shown = torch.from_numpy(restored(quantized(image.cpu().numpy()))).to(scene.device)
+            quality[name].append(frame_quality(shown, frame, metrics))
+            distances[name].append(psnr(image, limit))
+    return quality, distances
+
+
+def _frame_times(scene: SceneGraph, views: Sequence[View], ways: Mapping[str, RenderOptions]) -> dict[str, list[float]]:
+    """Milliseconds of single frames, the ways in turn at each view: what drifts meets all of them alike."""
+    clock = clock_of(scene.device)
+    times: dict[str, list[float]] = {name: [] for name in ways}
+    for turn in range(ROUNDS):
+        timed = {
+            name: options for name, options in ways.items() if not turn or statistics.median(times[name]) < SLOW_MS
+        }
+        for view in views:
+            for name, options in timed.items():
+                start = clock.mark()
+                frame_image(scene, view, options)
+                times[name].append(1000 * clock.seconds(start, clock.mark()))
+    return times
+
+
+def _exact(settings: SplatSettings) -> SplatSettings:
+    """No splat ends, no pixel stops and nothing is rounded; what a splat is (its clamp, its low-pass) stays."""
+    return replace(settings, alpha_min=0.0, transmittance_min=0.0, max_sigma=math.inf, half_colors=False, depth_bits=32)
 
 
 @dataclass(frozen=True)

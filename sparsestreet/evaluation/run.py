@@ -9,14 +9,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation.effect_gains import measure_effect_gains
-from sparsestreet.evaluation.evaluate import evaluate_frames, lidar_masks, screen_image
-from sparsestreet.evaluation.node_costs import measure_scene_costs
-from sparsestreet.evaluation.predictions import Predictions
-from sparsestreet.evaluation.speed import Timing, measure_latency
+from sparsestreet.data.lazy import Frames, as_frames, spread
+from sparsestreet.evaluation.evaluate import Predictions, evaluate_frames, lidar_masks, screen_image
+from sparsestreet.evaluation.speed import Timing, measure_latency, measure_scene_costs
 from sparsestreet.metrics.definitions import DEFINITIONS
-from sparsestreet.metrics.lpips_weights import open_lpips
+from sparsestreet.metrics.lpips import open_lpips
 from sparsestreet.ops import Guards, guards
 from sparsestreet.phases import stage
 from sparsestreet.pictures.images import KINDS, Picture, draw_lidar_end, error_picture, write_picture, write_png
@@ -34,6 +31,41 @@ from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Frame, View
+
+MOST_IMAGES = 60
+"""Images that are rendered without each effect, spread over all."""
+
+
+@torch.no_grad()
+def measure_effect_gains(
+    scene: SceneGraph,
+    frames: Frames,
+    quality: Sequence[FrameQuality],
+    options: RenderOptions,
+    ranks: Ranks = ALONE,
+) -> dict[str, EffectGain]:
+    """Name of each effect of the scene -> its gain on ``frames``, of which ``quality`` is that of the whole scene.
+
+    ``ranks``: as in ``evaluate_frames``.
+    """
+    chosen = spread(len(frames), MOST_IMAGES)
+    whole = _means([quality[index] for index in chosen])
+    gains = {}
+    for name in (name for name, effect in scene.effects.items() if effect.is_on):
+        without = _means(list(evaluate_frames(scene.without(name), frames.at(chosen), options, ranks=ranks)))
+        full, vehicle, human = (_less(*pair) for pair in zip(whole, without, strict=True))
+        if full is not None:
+            gains[name] = EffectGain(full, vehicle, human, len(chosen))
+    return gains
+
+
+def _means(quality: Sequence[FrameQuality]) -> list[float | None]:
+    summary = summarize(quality)
+    return [summary[metric].mean for metric in ("psnr_full", "psnr_vehicle", "psnr_human")]
+
+
+def _less(whole: float | None, without: float | None) -> float | None:
+    return None if whole is None or without is None else whole - without
 
 
 @torch.no_grad()
@@ -122,7 +154,7 @@ def help_to_evaluate(
 
 
 def _splits(held_out: Frames | tuple[Frame, ...], training: Frames | tuple[Frame, ...]) -> dict[str, Frames]:
-    return {split: Frames.of(frames) for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
+    return {split: as_frames(frames) for split, frames in ((HELD_OUT, held_out), (TRAINING, training)) if frames}
 
 
 def _looks(

@@ -1,9 +1,15 @@
-"""How long one image takes by three clocks: medians over many renders, with the device waited for."""
+"""What a scene costs where it is rendered: milliseconds of a frame, of each node and effect, and memory."""
 
+import copy
+import resource
+import statistics
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import groupby
+from operator import sub
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -11,14 +17,47 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sparsestreet.evaluation.scene_parts import has_masks, without_closed_rows
 from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import splat
+from sparsestreet.phases import PhaseRecorder, clock_of
+from sparsestreet.records.costs import NodeCost
 from sparsestreet.records.latency import FRAME, RASTER, RIG, Latency, Percentiles
 from sparsestreet.records.provenance import processor_name
+from sparsestreet.records.run import Noise
+from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes import Node
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import View
+
+
+def has_masks(scene: SceneGraph) -> bool:
+    """Whether any node still has a mask."""
+    return any(node.mask is not None for node in scene.nodes.values())
+
+
+def without_masks(scene: SceneGraph) -> SceneGraph:
+    """The scene with every row shown at all times."""
+    return scene.with_nodes({name: _unmasked(node) for name, node in scene.nodes.items()})
+
+
+def without_closed_rows(scene: SceneGraph, time: float) -> SceneGraph:
+    """The scene as it is at a normalized time, without the rows that masks close then, and without the masks."""
+    nodes = {}
+    for name, node in scene.nodes.items():
+        nodes[name] = _unmasked(node)
+        if node.mask is not None:
+            nodes[name].rows.resize(RowPlan.keep(node.mask.multipliers(node.rows, time) > 0))
+    return scene.with_nodes(nodes)
+
+
+def _unmasked(node: Node) -> Node:
+    if node.mask is None:
+        return node
+    bare = copy.deepcopy(node)
+    bare.mask = None
+    return bare
+
 
 T = TypeVar("T")
 
@@ -183,3 +222,107 @@ def _wait_for(device: torch.device) -> None:
     """CUDA kernels run behind the host's back: without this the clock sees launches only."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
+
+
+OUTPUT = "output"
+"""The part of a frame that is in no phase: what holds the others together, and uint8."""
+
+MASKS = "masks"
+"""All masks together, beside the effects of a scene."""
+
+_WARMUP = 2
+"""Rounds that do not count."""
+
+
+@dataclass(frozen=True)
+class SceneCosts:
+    """Fields of ``CostRecord``, as far as a scene and views tell them."""
+
+    frame_ms: dict[str, float]
+    nodes: dict[str, NodeCost]
+    effects: dict[str, float]
+    noise: Noise
+
+
+@torch.no_grad()
+def measure_scene_costs(
+    scene: SceneGraph, views: Sequence[View], options: RenderOptions, *, repeats: int = 30
+) -> SceneCosts:
+    """Leave-one-out costs on the scene's device, in frames as ``speed.measure_latency`` times them.
+
+    Each of ``repeats`` rounds takes the next view and draws it whole and with one thing left out after the other, so
+    that a machine that gets slower does so for all. Costs are medians over the rounds of whole less left out. A scene
+    of one node is compared with one of no Gaussian.
+
+    Raises ValueError without views, or if ``repeats`` is below 1.
+    """
+    if not views or repeats < 1:
+        raise ValueError(f"costs need at least one view and one repeat, got {len(views)} and {repeats}")
+    before = calibrate(scene.device)
+    left_out = {name: scene.without(name) for name in scene.nodes}
+    effects = {name: scene.without(name) for name, effect in scene.effects.items() if effect.is_on}
+    if has_masks(scene):
+        effects[MASKS] = without_masks(scene)
+    rounds = _rounds({"": scene} | left_out | effects, views, options, repeats)
+    frames = rounds.pop("")
+    without = {name: [sum(parts.values()) for parts in times] for name, times in rounds.items()}
+    whole = [sum(parts.values()) for parts in frames]
+    costs = {name: statistics.median(map(sub, whole, times)) for name, times in without.items()}
+    counts, sizes = scene.counts(), {name: node.row_bytes() + node.pose_bytes() for name, node in scene.nodes.items()}
+    return SceneCosts(
+        frame_ms={part: statistics.median(parts[part] for parts in frames) for part in frames[0]},
+        nodes={
+            name: NodeCost(counts[name], sizes[name] / 1e6, statistics.median(without[name]), costs[name])
+            for name in left_out
+        },
+        effects={name: costs[name] for name in effects},
+        noise=noise_between(before, calibrate(scene.device)),
+    )
+
+
+def _rounds(
+    variants: Mapping[str, SceneGraph], views: Sequence[View], options: RenderOptions, repeats: int
+) -> dict[str, list[dict[str, float]]]:
+    """Variant -> part of a frame -> milliseconds, for each round."""
+    times: dict[str, list[dict[str, float]]] = {name: [] for name in variants}
+    for index in range(-_WARMUP, repeats):
+        view = views[index % len(views)]
+        for name, variant in variants.items():
+            parts = _frame_parts(variant, view, options)
+            if index >= 0:
+                times[name].append(parts)
+    return times
+
+
+def _frame_parts(scene: SceneGraph, view: View, options: RenderOptions) -> dict[str, float]:
+    recorder = PhaseRecorder(clock_of(scene.device), outside=OUTPUT)
+    recorder.start()
+    frame_image(scene, view, options)
+    return {name: 1e3 * seconds for name, seconds in recorder.stop().items()}
+
+
+_STATUS, _FORGET = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+
+
+def forget_peaks() -> None:
+    """Let the peaks start anew: a process may make several runs."""
+    with suppress(OSError):  # not Linux, or not allowed: the peak is that of the process
+        _FORGET.write_text("5")
+    if torch.cuda.is_initialized():
+        for device in range(torch.cuda.device_count()):
+            torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_megabytes(device: torch.device) -> tuple[float, float | None]:
+    """10^6 bytes of the process on the host, and those that torch had allocated on a GPU (None on the CPU)."""
+    on_device = torch.cuda.max_memory_allocated(device) / 1e6 if device.type == "cuda" else None
+    return _peak_of_the_host() * 1024 / 1e6, on_device
+
+
+def _peak_of_the_host() -> int:
+    """KiB. What ``forget_peaks`` resets is only in the status file."""
+    if _STATUS.is_file():
+        for line in _STATUS.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1])
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -10,7 +10,7 @@ from torch import Tensor
 from sparsestreet.data.lazy import Sweeps
 from sparsestreet.evidence.shear import ReadoutShear, readout_shear
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Camera, Shutter, View
 
 QUANTILE = 0.9

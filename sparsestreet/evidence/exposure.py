@@ -12,8 +12,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.geometry.boxes import box_at, inside_box
-from sparsestreet.geometry.cameras import project
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.types import Camera, Frame, Sweep, Track, View
 
 MOST_IMAGES = 240

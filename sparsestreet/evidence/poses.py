@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int
 
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.evidence.bundle import Bundle, adjust
-from sparsestreet.geometry.distortion import undistort
+from sparsestreet.geometry.lenses import undistort
 from sparsestreet.triangulation import ImagePointSettings, street_points
 from sparsestreet.triangulation.points import TriangulatedPoints
 from sparsestreet.triangulation.rays import Observations

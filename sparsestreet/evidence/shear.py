@@ -8,8 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.data.lazy import Sweeps, spread
-from sparsestreet.geometry.cameras import project
-from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.geometry.cameras import project, transform_points
 from sparsestreet.types import Camera, Shutter, View
 
 MOST_VIEWS = 60

@@ -15,7 +15,7 @@ import numpy as np
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.export.recording import Cloud, Part
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.listening import Callers
 from sparsestreet.types import View
 

@@ -9,8 +9,7 @@ from dataclasses import replace
 import torch
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.cameras import moved
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse, moved
 from sparsestreet.types import Camera, View
 
 Rig = tuple[View, ...]

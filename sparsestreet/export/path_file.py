@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from sparsestreet.export.path import CameraPath
 from sparsestreet.export.rig import intrinsics
-from sparsestreet.geometry.transforms import inverse, rigidity_error
+from sparsestreet.geometry.cameras import inverse, rigidity_error
 from sparsestreet.types import Camera, View
 
 KINDS = ("camera_path", "poses", "keyframes")

@@ -5,8 +5,14 @@ street has 60 to 600 images against 2,048 features. Compare only runs on the sam
 first.
 """
 
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
+
+from sparsestreet.metrics.lpips import Lpips
 
 INCEPTION = "inception"
 """Name of the one extractor whose Frechet distance may be called FID."""
@@ -76,3 +82,26 @@ def _checked(features: Float[np.ndarray, "n d"], name: str) -> Float[np.ndarray,
     if not np.isfinite(features).all():
         raise ValueError(f"a {name} distance needs finite features, got NaN or infinity: look at the extractor")
     return features.astype(np.float64)
+
+
+@runtime_checkable
+class Extractor(Protocol):
+    """Computes the features of an image. ``name`` is that of the network; "inception" is reserved for that of FID."""
+
+    @property
+    def name(self) -> str: ...
+
+    def __call__(self, image: Float[Tensor, "h w 3"]) -> Float[np.ndarray, " d"]:
+        """Returns the features of an image in [0, 1]."""
+        ...
+
+
+@dataclass(frozen=True)
+class LastLayer:
+    """The last layer of an LPIPS network, averaged over the image."""
+
+    name: str
+    network: Lpips
+
+    def __call__(self, image: Float[Tensor, "h w 3"]) -> Float[np.ndarray, " d"]:
+        return self.network.features(image)[-1].double().mean((1, 2)).cpu().numpy()

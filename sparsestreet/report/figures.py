@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of

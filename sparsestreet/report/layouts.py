@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.failures import FailedRun
 from sparsestreet.records.quality import HELD_OUT, TRAINING
 from sparsestreet.report.arms import Arm, Value, busy_arms
@@ -109,7 +109,7 @@ def _value(key: Key, protocol: Protocol) -> Value | None:
 def metric_id(protocol: Protocol, region: str, quantity: str) -> str | None:
     """Returns the id of a metric under a protocol, or None.
 
-    >>> from sparsestreet.metrics.protocols import DRIVESTUDIO
+    >>> from sparsestreet.metrics.definitions import DRIVESTUDIO
     >>> metric_id(DRIVESTUDIO, "full", "psnr") == DRIVESTUDIO.psnr
     True
     """

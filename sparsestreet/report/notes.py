@@ -3,8 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 
-from sparsestreet.metrics.definitions import LIDAR_REACH
-from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.metrics.definitions import LIDAR_REACH, Protocol
 from sparsestreet.records.quality import TRAINING
 from sparsestreet.records.run import CodeVersion, Machine
 from sparsestreet.records.summary import RunSummary

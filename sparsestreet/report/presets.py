@@ -4,7 +4,7 @@ import statistics
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 
-from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report.arms import Arm, Unit, mean_over_scenes
 from sparsestreet.report.collect import RunRecord

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.records.quality import HELD_OUT, TRAINING
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.notes import frames_steady, training_steady

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.records.held_out import HELD_OUT_CURVE
 from sparsestreet.records.quality import HELD_OUT, TRAINING
 from sparsestreet.records.run import RunDescription

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.records.configuration import Setting, config_hash, differing_options, only, without
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.collect import RunRecord, check_definitions

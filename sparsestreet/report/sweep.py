@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, Protocol
+from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import write_atomically
 from sparsestreet.report.arms import Arm, arms, busy_arms, incomplete, plain_of, why_apart

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.arms import Arm, Unit, Value, busy_arms, by_scene, mean_over_scenes, plain_of

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sparsestreet.metrics.protocols import Protocol
+from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.quality import HELD_OUT
 from sparsestreet.report.arms import Arm, plain_of
 from sparsestreet.report.intervals import ConfidenceInterval

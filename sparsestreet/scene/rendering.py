@@ -36,18 +36,17 @@ class SceneRendering:
     """Name of a node -> what it answered for the view, before activation."""
     gaussians: Gaussians
     """What was drawn, activated."""
+    state: SceneState = FINISHED
+    options: RenderOptions = DEFAULT_OPTIONS
+    """How it was rendered."""
+    gates: Float[Tensor, " n"] | None = None
+    """Which of its Gaussians masks sampled for a training step; None: all."""
 
     @property
     def drawn(self) -> dict[str, Bool[Tensor, " _"]]:
         """Name of a node -> which of its rows the view shows."""
         visible = self.splats.visible
         return {name: visible[rows] for name, rows in self.spans.items()}
-
-    state: SceneState = FINISHED
-    options: RenderOptions = DEFAULT_OPTIONS
-    """How it was rendered."""
-    gates: Float[Tensor, " n"] | None = None
-    """Which of its Gaussians masks sampled for a training step; None: all."""
 
 
 def render(

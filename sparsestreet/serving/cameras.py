@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.geometry.cameras import resized
-from sparsestreet.geometry.distortion import largest_shift
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse, resized
+from sparsestreet.geometry.lenses import largest_shift
 from sparsestreet.scene.edits.paths import between
 from sparsestreet.serving import wire
 from sparsestreet.types import Camera, Shutter, Side

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.records.rig import RigRecord
 from sparsestreet.scene.edits.paths import between
 from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_of

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import torch
 
-from sparsestreet.evaluation.memory import peak_megabytes
+from sparsestreet.evaluation.speed import peak_megabytes
 from sparsestreet.phases import StageRecorder
 from sparsestreet.records.costs import stage_costs, step_costs, update_costs
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from sparsestreet.on_its_way import OnItsWay, on_its_way
+from sparsestreet.host_copy import HostCopy, copy_to_host
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import View
 
@@ -22,7 +22,7 @@ class LossWatch:
     """Looks at the terms of each loss: in the step itself on the CPU, one step later on a device."""
 
     def __init__(self) -> None:
-        self._pending: tuple[OnItsWay, tuple[str, ...], SceneGraph, View, int] | None = None
+        self._pending: tuple[HostCopy, tuple[str, ...], SceneGraph, View, int] | None = None
 
     def look(self, names: Iterable[str], terms: Tensor, scene: SceneGraph, view: View, step: int) -> None:
         """Before anything is learned from the ``step``-th step. Raises NotFiniteError, on a device for the step before.
@@ -38,7 +38,7 @@ class LossWatch:
         # One number is looked at in a step whose loss is finite.
         on_host = terms.device.type == "cpu"
         if not on_host or not bool(terms.detach().sum().isfinite()):
-            self._pending = (on_its_way(terms.detach()), tuple(names), scene, view, step)
+            self._pending = (copy_to_host(terms.detach()), tuple(names), scene, view, step)
         if on_host:
             self.settle()
 
@@ -48,7 +48,7 @@ class LossWatch:
         if pending is None:
             return
         terms, names, scene, view, step = pending
-        values = terms.arrived()
+        values = terms.wait()
         if bool(values.sum().isfinite()):
             return
         wrong = [f"{name} = {value:g}" for name, value in zip(names, values.tolist(), strict=True)

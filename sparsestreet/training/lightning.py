@@ -49,11 +49,6 @@ def ranks_of(trainer: Trainer) -> Ranks:
     return getattr(trainer.strategy, "ranks", ALONE)
 
 
-def shares_validation(trainer: Trainer) -> bool:
-    """Whether each of several processes validates on its share of the images."""
-    return ranks_of(trainer).size > 1 and getattr(trainer.val_dataloaders, "shared", False)
-
-
 def images_per_step(trainer: Trainer) -> int:
     """Images whose mean gradient a step takes: of all processes, and of ``accumulate_grad_batches`` batches."""
     return trainer.world_size * trainer.accumulate_grad_batches

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from sparsestreet.on_its_way import OnItsWay, on_its_way
+from sparsestreet.host_copy import HostCopy, copy_to_host
 from sparsestreet.training.adam import RefusedRows
 from sparsestreet.training.finite import NotFiniteError, seen_from
 from sparsestreet.types import View
@@ -26,7 +26,7 @@ _NAMED = 3
 class _Look:
     """At the rows that a step refused."""
 
-    counts: OnItsWay
+    counts: HostCopy
     names: tuple[str, ...]
     rows: tuple[int, ...]
     view: View
@@ -58,7 +58,7 @@ class Quarantine:
             by_id = {id(parameter): name for name, parameter in named}
             self._ids, self._names = ids, tuple(by_id.get(one, "a parameter") for one in ids)
         rows = tuple(len(one) if one.dim() else 1 for one in refused.parameters)
-        self._pending = _Look(on_its_way(refused.counts), self._names, rows, view, step)
+        self._pending = _Look(copy_to_host(refused.counts), self._names, rows, view, step)
         if on_host:
             self.settle()
 
@@ -69,7 +69,7 @@ class Quarantine:
             return
         found = [
             (name, rows, count, first)
-            for name, rows, (count, first) in zip(look.names, look.rows, look.counts.arrived().tolist(), strict=True)
+            for name, rows, (count, first) in zip(look.names, look.rows, look.counts.wait().tolist(), strict=True)
             if count
         ]
         if not found:

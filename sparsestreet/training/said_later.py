@@ -8,7 +8,7 @@ import torch
 from lightning import Trainer
 from torch import Tensor
 
-from sparsestreet.on_its_way import OnItsWay, on_its_way
+from sparsestreet.host_copy import HostCopy, copy_to_host
 from sparsestreet.training.lightning import log_numbers, logged_number
 
 
@@ -21,13 +21,13 @@ class _Step:
     """Under which number the loggers file it."""
     epoch: int
     names: tuple[str, ...]
-    values: OnItsWay
+    values: HostCopy
     known: Mapping[str, float]
     """What the host knows already."""
 
     def arrived(self) -> dict[str, float]:
         """By name; waits for the copy."""
-        return dict(zip(self.names, self.values.arrived().tolist(), strict=True)) | dict(self.known)
+        return dict(zip(self.names, self.values.wait().tolist(), strict=True)) | dict(self.known)
 
 
 class SaidLater:
@@ -41,7 +41,7 @@ class SaidLater:
         """Queue the copies of a step's numbers; of several images of a step the last is heard."""
         numbers = torch.stack([value.detach().double() for value in values.values()])
         place = trainer.global_step, logged_number(trainer), trainer.current_epoch
-        self._step = _Step(*place, tuple(values), on_its_way(numbers), known)
+        self._step = _Step(*place, tuple(values), copy_to_host(numbers), known)
 
     def pass_on(self, trainer: Trainer) -> None:
         """Hand what an earlier step has said to Lightning's loggers, under that step; waits if it is not there yet."""
@@ -54,7 +54,7 @@ class SaidLater:
     @property
     def is_there(self) -> bool:
         """Whether there is something to pass on, and it has arrived."""
-        return self._step is not None and self._step.values.is_there
+        return self._step is not None and self._step.values.ready
 
     @property
     def newest(self) -> Mapping[str, float]:

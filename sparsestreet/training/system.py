@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Mapping
-from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -11,7 +10,8 @@ from lightning import LightningModule
 from torch import Tensor
 from torch.optim import Optimizer
 
-from sparsestreet.metrics.image import masked_psnr, psnr, psnr_on_device
+from sparsestreet.metrics.image import psnr_on_device
+from sparsestreet.metrics.reported import Psnr
 from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
@@ -23,10 +23,8 @@ from sparsestreet.training.lightning import (
     images_per_step,
     logs_now,
     ranks_of,
-    shares_validation,
 )
-from sparsestreet.training.losses import Loss
-from sparsestreet.training.losses.hood import without_hood
+from sparsestreet.training.losses import Loss, without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from sparsestreet.training.quarantine import Quarantine
@@ -92,8 +90,7 @@ class StreetSystem(LightningModule):
         self._view: View | None = None
         """Of the step that is under way."""
         self._course: Course | None = None
-        self._looks: list[dict[str, float]] = []
-        """What a validation that is shared has measured so far."""
+        self.held_out_psnr = Psnr(("full", "human", "vehicle"))
         self.train_psnr: deque[Tensor] = deque(maxlen=10)
         self.said = SaidLater()
         """What training steps logged: PSNR, the terms, the number of Gaussians."""
@@ -161,32 +158,20 @@ class StreetSystem(LightningModule):
                 self.quarantine.look(refused, self.scene.named_parameters(), self._view, step)
 
     def on_validation_epoch_start(self) -> None:
-        self._looks = []
+        self.held_out_psnr.reset()
 
     def validation_step(self, frame: Frame, index: int) -> None:
         with torch.autocast(self.device.type, enabled=False):
             image = render(self.scene, frame, self.state(), self.options).rgb.clamp(0, 1)
-            truth = frame.image.to(image.dtype) / 255
-            look = {"val/psnr": psnr(image, truth)}
-            for region in ("human", "vehicle"):
-                mask = getattr(frame, region)
-                value = None if mask is None else masked_psnr(image, truth, mask)
-                if value is not None:
-                    look[f"val/psnr_{region}"] = value
-        if shares_validation(self.trainer):
-            self._looks.append(look)
-        else:
-            self.log_dict(look, batch_size=1)
+            masks = {name: mask for name in ("human", "vehicle") if (mask := getattr(frame, name)) is not None}
+            self.held_out_psnr.update(image, frame.image.to(image.dtype) / 255, masks)
 
     def on_validation_epoch_end(self) -> None:
-        """Of several processes all log the means over the images of all, summed in the order of one process."""
-        if not shares_validation(self.trainer):
-            return
-        in_turn = zip_longest(*ranks_of(self.trainer).gathered(self._looks), fillvalue={})
-        looks = [look for turn in in_turn for look in turn]
-        for name in dict.fromkeys(name for look in looks for name in look):
-            values = [torch.tensor(look[name]) for look in looks if name in look]
-            self.log(name, sum(values[1:], values[0]) / len(values), batch_size=1)
+        """Log the means over the images of all processes."""
+        with ranks_of(self.trainer).answering():
+            means = self.held_out_psnr.compute()
+        for region, mean in means.items():
+            self.log("val/psnr" if region == "full" else f"val/psnr_{region}", mean, batch_size=1)
 
     def configure_optimizers(self) -> Optimizer:
         return self.optimizer_settings.build(self.scene, self.radius, images_per_step(self.trainer))

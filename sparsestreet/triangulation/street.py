@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.geometry.boxes import box_at
-from sparsestreet.geometry.distortion import undistort
+from sparsestreet.geometry.lenses import undistort
 from sparsestreet.triangulation.features import Features, find_features
 from sparsestreet.triangulation.points import Sighting, TriangulatedPoints, triangulate
 from sparsestreet.triangulation.settings import ImagePointSettings

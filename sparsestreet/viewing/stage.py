@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, UInt8
 from scipy.spatial.transform import Rotation, Slerp
 
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, View
 from sparsestreet.viewing.edit_state import EditState

@@ -21,7 +21,7 @@ from sparsestreet.export import rig, video
 from sparsestreet.export.layers import LAYERS, layer_values
 from sparsestreet.export.path import recorded, resized, shifted
 from sparsestreet.export.seen import count_images
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.edits import REMOVED, Edits, edited
 from sparsestreet.scene.storage import save_scene

@@ -6,7 +6,7 @@ import typing
 import pytest
 
 from sparsestreet.cli.commands.report import ReportRequest, report
-from sparsestreet.metrics.protocols import PROTOCOLS
+from sparsestreet.metrics.definitions import PROTOCOLS
 from sparsestreet.records.summary import SUMMARY
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import write_sweep

@@ -16,9 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 from sparsestreet import load_scene
 from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.evaluation.speed import Timing
-from sparsestreet.metrics.lpips import ALEX
-from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
-from sparsestreet.metrics.protocols import PROTOCOLS
+from sparsestreet.metrics.definitions import PROTOCOLS
+from sparsestreet.metrics.lpips import ALEX, FOLDER_VARIABLE
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.novel import NOVEL
 from sparsestreet.records.presets import PRESETS

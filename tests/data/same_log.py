@@ -3,7 +3,7 @@
 import torch
 
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Frame, Track, View
 
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.types import Camera, Frame, Sweep
 
@@ -21,5 +21,5 @@ def make_log(num_frames: int = 12, num_cameras: int = 2, sweeps: tuple[Sweep, ..
             sky = torch.zeros(3, 5, dtype=torch.bool)
             frames.append(Frame(camera, index / max(num_frames - 1, 1), index, number, image=image, sky=sky))
     return DrivingLog(
-        "tiny", Frames.of(frames), Sweeps.of(sweeps), (), num_frames, num_cameras, torch.eye(4, dtype=torch.float64)
+        "tiny", as_frames(frames), Sweeps.of(sweeps), (), num_frames, num_cameras, torch.eye(4, dtype=torch.float64)
     )

@@ -13,7 +13,7 @@ from rich.console import Console
 from sparsestreet.data.check import report_check
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.ego import check_used
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import split
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 from tests.data.streets import make_log
@@ -99,7 +99,7 @@ def test_masks_that_leave_nothing_are_named(share, tmp_path, console, recwarn):
 
 def test_a_street_without_a_used_pixel_is_not_trained(tmp_path):
     log = make_log(4)
-    dark = Frames.of([replace(frame, ego=torch.ones(frame.image.shape[:2], dtype=torch.bool)) for frame in log.frames])
+    dark = as_frames([replace(frame, ego=torch.ones(frame.image.shape[:2], dtype=torch.bool)) for frame in log.frames])
     with pytest.raises(ValueError, match=r"8 of 8 images of .* have no pixel that is used, because masks or alpha"):
         check_used(dark, log.name)
-    check_used(Frames.of([*dark, *log.frames]), log.name)
+    check_used(as_frames([*dark, *log.frames]), log.name)

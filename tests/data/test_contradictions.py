@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from sparsestreet.data.contradictions import contradictions
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Camera, Frame, SparsePoints, Sweep, Track
 from tests.evidence import wall
 
@@ -109,7 +109,7 @@ def log(**changes) -> DrivingLog:
     offset = torch.eye(4, dtype=torch.float64)
     offset[:3, 3] = ORIGIN
     path = VehiclePath(torch.stack([vehicle(0.1 * instant) for instant in INSTANTS]))
-    sound = DrivingLog("crooked", Frames.of(frames()), sweeps(), TRACKS, 11, 2, offset, vehicle=path)
+    sound = DrivingLog("crooked", as_frames(frames()), sweeps(), TRACKS, 11, 2, offset, vehicle=path)
     return replace(sound, **changes)
 
 
@@ -119,7 +119,7 @@ def said_of(log: DrivingLog) -> tuple[str, ...]:
 
 def seen(change: Callable[[Frame], Frame]) -> DrivingLog:
     # Without lidar: what it says of wrong poses is not meant here.
-    return log(frames=Frames.of([change(frame) for frame in frames()]), sweeps=Sweeps.of(()))
+    return log(frames=as_frames([change(frame) for frame in frames()]), sweeps=Sweeps.of(()))
 
 
 def boxes(change: Callable[[Track], Track], *names: str) -> DrivingLog:
@@ -200,7 +200,7 @@ def sparse(points_change: Tensor, pose_change: Callable[[Tensor], Tensor] = lamb
         for frame in wall.frames(lambda instant, camera: torch.ones(3))
     ]
     found = SparsePoints(places.float(), wall.albedo(x, y) / 255)
-    return log(frames=Frames.of(turned), sparse_points=lambda: found, sweeps=Sweeps.of(()), vehicle=None, tracks=())
+    return log(frames=as_frames(turned), sparse_points=lambda: found, sweeps=Sweeps.of(()), vehicle=None, tracks=())
 
 
 def w_last(pose: Tensor) -> Tensor:
@@ -218,7 +218,7 @@ RIGHT = {
     "a car that stands": lambda: seen(
         lambda frame: replace(one_pose(frame), image=(frame.image * 0 + 0.8 * STILL).to(torch.uint8))
     ),
-    "one frame": lambda: log(frames=Frames.of(frames()[:1]), tracks=(), sweeps=Sweeps.of(())),
+    "one frame": lambda: log(frames=as_frames(frames()[:1]), tracks=(), sweeps=Sweeps.of(())),
     "noise of annotations": lambda: boxes(at_place(3, rigid(8.0, (0.3, 0.2, 0.0))), "parked"),
     "who turns round within two seconds": lambda: boxes(
         lambda one: replace(at_place(1, rigid(180, (0, 0, 0)))(one), frames=20 * one.frames, times=None), "bike"

@@ -14,7 +14,7 @@ import torch
 from sparsestreet.data.datamodule import HOST, ShuffledFrames, StreetData
 from sparsestreet.data.device import to_device
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.ranks import Ranks
 from sparsestreet.types import Frame, View
 from tests.data.drivestudio.folders import make_nuscenes
@@ -44,7 +44,7 @@ def test_no_two_epochs_have_the_same_order():
 @pytest.mark.parametrize(("size", "accumulated"), [(1, 3), (2, 1), (3, 1), (2, 2)])
 def test_processes_take_turns_in_the_order_of_one(size, accumulated):
     """Seven frames, which no number divides: no step ends with an epoch, and none has a frame of its own order."""
-    frames = Frames.of([frame_at(index) for index in range(7)])
+    frames = as_frames([frame_at(index) for index in range(7)])
     alone = ShuffledFrames(frames, 3)
     images = [frame.frame_index for _ in range(4 * size * accumulated) for frame in alone]
     several = [ShuffledFrames(frames, 3, ranks=Ranks(rank, size), accumulated=accumulated) for rank in range(size)]
@@ -55,7 +55,7 @@ def test_processes_take_turns_in_the_order_of_one(size, accumulated):
 
 
 def test_a_process_goes_on_at_its_own_place():
-    frames = Frames.of([frame_at(index) for index in range(7)])
+    frames = as_frames([frame_at(index) for index in range(7)])
     whole = list(ShuffledFrames(frames, 3, ranks=Ranks(1, 2)))
     resumed = ShuffledFrames(frames, 3, ranks=Ranks(1, 2))
     resumed.load_state_dict({"finished": 4})

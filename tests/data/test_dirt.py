@@ -7,7 +7,7 @@ import torch
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.dirt import find_dirt
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.effects import DirtSettings
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -28,7 +28,7 @@ def frames(opacity: float = 0.95, spot: torch.Tensor = SPOT) -> Frames:
             frame = wall.frame(instant, number, torch.full((3,), 1.5))
             dirty = torch.where(spot[..., None], (1 - opacity) * frame.image + opacity * 20, frame.image).byte()
             made.append(replace(frame, image=frame.image if number else dirty))
-    return Frames.of(made)
+    return as_frames(made)
 
 
 def sweeps() -> Sweeps:

@@ -8,8 +8,8 @@ import torch
 
 from sparsestreet.data import hood as hood_module
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.hood import find_hoods, with_hoods
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.hood import find_hoods, with_ego
+from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.types import Camera, Frame, Sweep
 from tests.data.streets import make_log
 
@@ -33,7 +33,7 @@ def frames(hood: torch.Tensor | None, step: float = 3.0, noise: int = 2, camera:
         pose = torch.eye(4)
         pose[2, 3] = -step * index
         made.append(Frame(Camera(pose, torch.eye(3), WIDTH, HEIGHT), index / COUNT, index, camera, image=image))
-    return Frames.of(made)
+    return as_frames(made)
 
 
 def shares(found: Frames) -> dict[int, float]:
@@ -65,7 +65,7 @@ def test_a_camera_whose_exposure_changes():
     for index, frame in enumerate(frames(HOOD)):
         image = torch.where(HOOD[..., None], frame.image + 70, frame.image).float()
         bright.append(replace(frame, image=(image * (0.8 + 0.4 * index / (COUNT - 1))).clamp(max=255).byte()))
-    assert torch.equal(find_hoods(Frames.of(bright), NO_LIDAR)[0].mask[-5:], FOUND[-5:])
+    assert torch.equal(find_hoods(as_frames(bright), NO_LIDAR)[0].mask[-5:], FOUND[-5:])
 
 
 LEFT = (torch.arange(WIDTH) < WIDTH // 2).expand(HEIGHT, WIDTH)
@@ -91,7 +91,7 @@ def test_what_moves_as_the_lidar_says_is_street(moving: torch.Tensor):
         seen.append(Frame(Camera(pose, intrinsics, WIDTH, HEIGHT), index / 4, index, 0, image=image))
         sweeps.append(Sweep(index, 0.0, points, torch.zeros_like(points), torch.zeros(len(points), dtype=torch.bool)))
     mask = ~LEFT | (torch.arange(HEIGHT)[:, None] >= HEIGHT // 2)
-    found = hood_module._without_street(mask, Frames.of(seen), Sweeps.of(tuple(sweeps)))
+    found = hood_module._without_street(mask, as_frames(seen), Sweeps.of(tuple(sweeps)))
     assert torch.equal(found, mask & ~moving)
 
 
@@ -107,24 +107,24 @@ def test_what_stays_dark_without_an_edge_is_no_hood():
     def shaded(frame: Frame) -> Frame:
         return Frame.of(frame, image=torch.cat((frame.image[:0], ramp[-HEIGHT:])))
 
-    assert shares(Frames.of([shaded(frame) for frame in found])) == {0: 0.0}
+    assert shares(as_frames([shaded(frame) for frame in found])) == {0: 0.0}
 
 
 def test_frames_get_it_beside_their_own_masks():
     own = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     own[0, 0] = True
     first, second = frames(HOOD), frames(None, camera=1)
-    masked = Frames.of([Frame.of(frame, image=frame.image, ego=own) for frame in first])
+    masked = as_frames([Frame.of(frame, image=frame.image, ego=own) for frame in first])
     every: Sequence[Frame] = (*masked, *second)
-    hoods = find_hoods(Frames.of(every), NO_LIDAR)
-    seen = with_hoods(Frames.of(every), hoods)
+    hoods = find_hoods(as_frames(every), NO_LIDAR)
+    seen = with_ego(as_frames(every), {camera: hood.mask for camera, hood in hoods.items()})
     assert torch.equal(seen[0].ego, own | FOUND)
     assert seen[COUNT].ego is None  # the other camera shows none
 
 
 def test_training_and_held_out_frames_lose_its_pixels():
     log = make_log(COUNT)
-    moving = Frames.of([Frame.of(frame, image=frame.image) for frame in frames(HOOD)])
+    moving = as_frames([Frame.of(frame, image=frame.image) for frame in frames(HOOD)])
     log = replace(log, frames=moving, num_frames=COUNT, num_cameras=1)
     data = StreetData(log, stride=4, offset=2, hood=0.02)
     for part in (data.split.train, data.split.held_out, data.driving_log.frames):

@@ -10,7 +10,7 @@ import torch
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
-from sparsestreet.data.recording import Boxes, LidarSweep, Recording, Shot, log_of
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, Recording, log_of
 from sparsestreet.data.rig import rig_camera
 from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.trajectories import Trajectories
@@ -43,7 +43,7 @@ def pixel_of(frame: int, points: np.ndarray) -> np.ndarray:
     )
 
 
-def image(shot: Shot) -> torch.Tensor:
+def image(shot: RecordedImage) -> torch.Tensor:
     """Gray, and red where the points on the car are when the image is taken."""
     pixels = torch.full((AHEAD.height, AHEAD.width, 3), 90, dtype=torch.uint8)
     if shot.camera == 0:
@@ -59,8 +59,10 @@ def sweep(frame: int) -> torch.Tensor:
 
 def recording(**changes) -> Recording:
     shots = [
-        Shot(frame, number, torch.from_numpy(PLAN.world_from_camera(frame, camera)), (frame, number), f"{frame}",
-             PLAN.image_stamp(frame, camera))
+        RecordedImage(
+            frame, number, torch.from_numpy(PLAN.world_from_camera(frame, camera)), (frame, number), f"{frame}",
+            PLAN.image_stamp(frame, camera),
+        )
         for frame in range(PLAN.num_frames)
         for number, camera in enumerate(PLAN.cameras)
     ]  # fmt: skip

@@ -5,7 +5,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.data.lazy import Frames, LazySequence, RecentlyUsed, Sweeps
+from sparsestreet.data.frame_cache import LruCache
+from sparsestreet.data.lazy import Frames, LazySequence, Sweeps, as_frames
 from sparsestreet.types import Frame, Sweep, View
 from tests.data.streets import make_log
 
@@ -40,9 +41,9 @@ def test_only_what_is_indexed_is_loaded():
 
 def test_frames_in_memory_are_their_own_views():
     frames = tuple(LOG.frames)
-    assert Frames.of(frames).views == frames
-    assert Frames.of(frames)[3] is frames[3]
-    assert Frames.of(LOG.frames) is LOG.frames
+    assert as_frames(frames).views == frames
+    assert as_frames(frames)[3] is frames[3]
+    assert as_frames(LOG.frames) is LOG.frames
 
 
 def test_sweeps_are_found_by_their_place_and_told_by_their_index():
@@ -79,7 +80,7 @@ def test_what_was_not_used_for_longest_makes_way():
         asked.append(key)
         return key
 
-    cache = RecentlyUsed(load, size=lambda value: value, room=10)
+    cache = LruCache(load, size=lambda value: value, room=10)
     assert [cache(key) for key in (3, 4, 2, 3)] == [3, 4, 2, 3]  # 9 of 10 are used
     assert asked == [3, 4, 2]
     cache(5)  # 14: 4 must go, for 3 was used after it, and 2 is enough to stay
@@ -101,7 +102,7 @@ def test_what_is_larger_than_the_room_is_not_kept_and_drives_nothing_out():
         asked.append(key)
         return key
 
-    cache = RecentlyUsed(load, size=lambda value: value, room=10)
+    cache = LruCache(load, size=lambda value: value, room=10)
     for key in (10, 11, 10, 11):
         assert cache(key) == key
     assert asked == [10, 11, 11]
@@ -117,7 +118,7 @@ def test_a_cache_never_holds_more_than_it_may_and_forgets_only_where_it_must(key
         asked.append(key)
         return key
 
-    cache = RecentlyUsed(load, size=lambda value: value, room=room)
+    cache = LruCache(load, size=lambda value: value, room=room)
     held, expected = [], []
     for key in keys:
         cache(key)

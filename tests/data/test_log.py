@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import split
 from sparsestreet.types import SparsePoints, Sweep, Track
 from tests.data.streets import make_log
@@ -140,7 +140,7 @@ def test_without_lidar_cameras_see_fifty_metres_ahead():
     assert torch.allclose(log.center, torch.tensor([1.0, 0, 25]))
     along_x = torch.tensor([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
     frame = replace(log.frames[0], camera=replace(log.frames[0].camera, camera_from_world=along_x))
-    assert torch.allclose(replace(log, frames=Frames.of([frame])).center, torch.tensor([25.0, 0, 0]))
+    assert torch.allclose(replace(log, frames=as_frames([frame])).center, torch.tensor([25.0, 0, 0]))
 
 
 def test_without_lidar_the_box_reaches_around_the_points_that_came_with_the_log():

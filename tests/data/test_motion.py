@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 
 from sparsestreet.data.motion import PosePath, untwisted
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from tests.conftest import unchecked
 
 START = 1_532_402_927_600_000_251

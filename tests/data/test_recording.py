@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sparsestreet.data.doubts import doubts
 from sparsestreet.data.problems import fault
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot, log_of
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.lenses import Fisheye, Lens, Rational
 from sparsestreet.types import Shutter
@@ -36,7 +36,7 @@ def test_no_loss_sees_what_the_lens_did_not_record(lens, user):
     recording = Recording(
         name="a",
         rig=[mounted],
-        shots=[Shot(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
+        shots=[RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
         read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
         read_masks=lambda shot: user,
     )
@@ -60,7 +60,7 @@ def test_points_that_came_with_the_log_are_in_its_world_and_give_no_depth():
     recording = Recording(
         name="a",
         rig=[camera(FLAT)],
-        shots=[Shot(0, 0, pose, key=None, stem="0")],
+        shots=[RecordedImage(0, 0, pose, key=None, stem="0")],
         read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
         read_masks=lambda shot: {},
         sparse_points=lambda: reads.append(1) or (ahead, torch.tensor([[0.25, 0.5, 0.75]])),
@@ -83,7 +83,7 @@ def test_points_that_are_not_finite_are_left_out_and_gray_ones_are_told(broken):
     recording = Recording(
         name="a",
         rig=[camera(FLAT)],
-        shots=[Shot(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
+        shots=[RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
         read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
         read_masks=lambda shot: {},
         sparse_points=lambda: (places, torch.full((5, 3), 0.5)),
@@ -101,7 +101,7 @@ def test_the_recording_car_has_no_returns():
     recording = Recording(
         name="a",
         rig=[camera(FLAT)],
-        shots=[Shot(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
+        shots=[RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
         read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
         read_masks=lambda shot: {"ego": HOOD},
         sweeps={0: LidarSweep(lambda: points)},
@@ -114,7 +114,7 @@ def test_the_recording_car_has_no_returns():
 def test_a_declared_shutter_arrives_at_the_view():
     rolling = Shutter(torch.tensor([0.0, 0.0, 0.4]), torch.zeros(3), direction="left")
     shots = [
-        Shot(frame, 0, torch.eye(4, dtype=torch.float64), key=None, stem="", shutter=shutter)
+        RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), key=None, stem="", shutter=shutter)
         for frame, shutter in enumerate((rolling, None))
     ]
     recording = Recording(
@@ -136,7 +136,7 @@ def test_boxes_of_one_object_that_differ_in_size_are_told():
     """One grows in length; the other is measured to a few centimeters."""
     grown, measured = moving([0, 1, 2], [100, 110, 125]), replace(moving([0, 2], [100, 125]), name="van")
     grown.sizes[2, 0], measured.sizes[1, 2] = 3.0, 1.09
-    shots = [Shot(frame, 0, torch.eye(4, dtype=torch.float64), None, "", 100 + frame) for frame in range(3)]
+    shots = [RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), None, "", 100 + frame) for frame in range(3)]
     black = torch.zeros(16, 24, 3, dtype=torch.uint8)
     recording = Recording(
         "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=(100, 101, 102),
@@ -162,7 +162,10 @@ def test_an_object_is_on_its_way_between_annotated_instants(
 ):
     stamps = [100, 110, 125, 130, 140]  # images do not come evenly
     own = {-2: 80, 0: 100, 2: 121, 4: 141, 6: 160}  # nor are boxes where images are
-    shots = [Shot(frame, 0, torch.eye(4, dtype=torch.float64), None, "", stamp) for frame, stamp in enumerate(stamps)]
+    shots = [
+        RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), None, "", stamp)
+        for frame, stamp in enumerate(stamps)
+    ]
     boxes = moving(frames, [own[frame] for frame in frames])
     black = torch.zeros(16, 24, 3, dtype=torch.uint8)
     recording = Recording(
@@ -186,7 +189,7 @@ class Broken(RecordedReader):
         def broken(what: str) -> NoReturn:
             raise fault(where / what, "it is broken", "write it again")
 
-        shot = Shot(0, 0, torch.eye(4, dtype=torch.float64), where / "image.png", "image")
+        shot = RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), where / "image.png", "image")
         return Recording(
             "a", [camera(FLAT)], [shot], lambda shot: broken("image.png"), lambda shot: broken("mask.png"),
             mask_kinds=frozenset({"sky"}), sweeps={0: LidarSweep(lambda: broken("sweep.bin"))},

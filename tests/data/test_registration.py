@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.registration import EdgeShift, edge_shift
 from sparsestreet.types import Camera, Frame, Sweep
 
@@ -37,7 +37,7 @@ def returns(index: int) -> Sweep:
 
 def measured(right: float, down: float, instants: int = 8, ego: torch.Tensor | None = None) -> EdgeShift | None:
     frame = Frame(camera(), 0.0, 0, 0, image=box_image(right, down), ego=ego)
-    frames = Frames.of([replace(frame, frame_index=index) for index in range(instants)])
+    frames = as_frames([replace(frame, frame_index=index) for index in range(instants)])
     return edge_shift(frames, Sweeps.of(tuple(returns(index) for index in range(instants))))
 
 
@@ -61,7 +61,7 @@ def test_few_edges_say_nothing():
 
 def test_images_without_a_sweep_are_passed_over():
     frame = Frame(camera(), 0.0, 0, 0, image=box_image(0.0, 0.0))
-    frames = Frames.of([replace(frame, frame_index=index) for index in range(16)])
+    frames = as_frames([replace(frame, frame_index=index) for index in range(16)])
     sweeps = Sweeps.of(tuple(returns(index) for index in range(8)))
     assert edge_shift(frames, sweeps) is not None
     assert edge_shift(frames, Sweeps.of(())) is None

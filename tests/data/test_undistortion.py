@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from sparsestreet.data.undistortion import Undistortion
-from sparsestreet.geometry.distortion import undistort
-from sparsestreet.geometry.lenses import BrownConrady, Fisheye, FTheta, Lens, Mei
+from sparsestreet.geometry.lenses import BrownConrady, Fisheye, FTheta, Lens, Mei, undistort
 from tests.typed import there
 
 WIDTH, HEIGHT = 60, 40

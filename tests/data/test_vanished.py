@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-from sparsestreet.data.ahead import ReadAhead
+from sparsestreet.data.frame_cache import Prefetcher
 from sparsestreet.data.images import read_image
 from sparsestreet.data.problems import LogError
 from sparsestreet.types import Frame
@@ -25,7 +25,7 @@ def test_a_frame_that_vanished_is_an_error_at_its_own_step_and_the_others_are_re
         read_image(paths[draw], (6, 4))
         return frame_at(draw)
 
-    ahead = ReadAhead(read, torch.device("cpu"), threads=2)
+    ahead = Prefetcher(read, torch.device("cpu"), threads=2)
     try:
         assert [ahead.take(draw).frame_index for draw in range(3)] == [0, 1, 2]
         with pytest.raises(LogError, match=r"3\.png.*cannot be decoded .*No such file"):

@@ -6,9 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation.effect_gains import measure_effect_gains
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.evaluation.evaluate import evaluate_frames
+from sparsestreet.evaluation.run import measure_effect_gains
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.cli.toy.gain import Gain, GainSettings
@@ -32,7 +32,7 @@ def scene() -> SceneGraph:
 
 @torch.no_grad()
 def test_the_gain_is_a_difference_of_psnr(scene: SceneGraph):
-    frames = Frames.of(tuple(street_log().frames)[:3])
+    frames = as_frames(tuple(street_log().frames)[:3])
     whole = list(evaluate_frames(scene, frames, OPTIONS))
     found = measure_effect_gains(scene, frames, whole, OPTIONS)
     without = scene.without("gain")
@@ -48,7 +48,7 @@ def test_regions_are_told_apart(scene: SceneGraph):
     frame = street_log().frames[0]
     mask = torch.zeros(frame.image.shape[:2], dtype=torch.bool)
     mask[: len(mask) // 2] = True
-    frames = Frames.of((replace(frame, vehicle=mask),))
+    frames = as_frames((replace(frame, vehicle=mask),))
     found = measure_effect_gains(scene, frames, list(evaluate_frames(scene, frames, OPTIONS)), OPTIONS)["gain"]
     assert found.vehicle is not None
     assert found.human is None

@@ -11,8 +11,7 @@ import torch
 from skimage.metrics import structural_similarity
 
 from sparsestreet.evaluation import evaluate
-from sparsestreet.evaluation.evaluate import evaluate_frames
-from sparsestreet.evaluation.predictions import Predictions
+from sparsestreet.evaluation.evaluate import Predictions, evaluate_frames
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips import ALEX, Lpips, lpips_of_layers, masked_lpips_of_layers
 from sparsestreet.ops import SplatSettings

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation import extra
 from sparsestreet.evaluation.extra import ExtraMetrics, _of_presets, _of_shifts
@@ -28,7 +28,7 @@ def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_
     monkeypatch.setattr(extra, "open_lpips", lambda device: ({}, {"lpips_alex": "no weights"}))
     frames = tuple(make_frame(index) for index in range(3))
     data = StreetData(
-        DrivingLog("three", Frames.of(frames), Sweeps.of(()), (), 3, 1, torch.eye(4).double()), stride=stride, offset=1
+        DrivingLog("three", as_frames(frames), Sweeps.of(()), (), 3, 1, torch.eye(4).double()), stride=stride, offset=1
     )
     (tmp_path / "records").mkdir()
     said = []
@@ -54,7 +54,7 @@ def test_what_is_said_of_a_side():
 def street(count=4, **changes):
     """Of so many instants the second and fourth are held out."""
     frames = tuple(make_frame(index) for index in range(count))
-    log = DrivingLog("some", Frames.of(frames), Sweeps.of(()), (), count, 1, torch.eye(4).double(), **changes)
+    log = DrivingLog("some", as_frames(frames), Sweeps.of(()), (), count, 1, torch.eye(4).double(), **changes)
     return StreetData(log, stride=2, offset=1)
 
 

@@ -6,10 +6,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.evaluation import node_costs
-from sparsestreet.evaluation.node_costs import OUTPUT, measure_scene_costs
-from sparsestreet.evaluation.scene_parts import without_closed_rows, without_masks
-from sparsestreet.evaluation.speed import measure_latency
+from sparsestreet.evaluation import speed
+from sparsestreet.evaluation.speed import (
+    OUTPUT,
+    measure_latency,
+    measure_scene_costs,
+    without_closed_rows,
+    without_masks,
+)
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.noise import Calibration
 from sparsestreet.scene.effects import Lens, LensSettings, RollingShutter, ShutterSettings, Sky
@@ -77,12 +81,12 @@ def timed(monkeypatch, seconds):
     """Frames on a clock that only they move; ``seconds`` of (scene, view)."""
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    monkeypatch.setattr(node_costs, "calibrate", lambda device: Calibration(1.0, 0.0, None))
+    monkeypatch.setattr(speed, "calibrate", lambda device: Calibration(1.0, 0.0, None))
 
     def frame(scene, view, options):
         now[0] += seconds(scene, view)
 
-    monkeypatch.setattr(node_costs, "frame_image", frame)
+    monkeypatch.setattr(speed, "frame_image", frame)
 
 
 def test_costs_are_what_a_frame_takes_longer(monkeypatch):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation import novel as novel_module
+from sparsestreet.data.lazy import as_frames
+from sparsestreet.evaluation import extra as novel_module
 from sparsestreet.evaluation.evaluate import screen_image
-from sparsestreet.evaluation.novel import evaluate_novel, shifted_views
+from sparsestreet.evaluation.extra import evaluate_novel, shifted_views
 from sparsestreet.metrics.distances import frechet_distance, kernel_distance
 from sparsestreet.metrics.lpips import Lpips
 from sparsestreet.records.novel import NOVEL
@@ -46,8 +46,8 @@ class MeanDifference(Lpips):
     def __init__(self):
         pass
 
-    def __call__(self, image, truth):
-        return float((image - truth).mean())
+    def layer_maps(self, image, truth):
+        return ((image - truth).mean(-1),)
 
 
 def rig(count):
@@ -57,7 +57,7 @@ def rig(count):
 
 def evaluate(frames, offsets=(2.0,), truth=None, extractor=None, **replaced):
     options = {"command": "c", "truth": truth, "extractor": extractor, "absent": "no weights"} | replaced
-    return evaluate_novel(SCENE, Frames.of(tuple(frames)), offsets, OPTIONS, **options)
+    return evaluate_novel(SCENE, as_frames(tuple(frames)), offsets, OPTIONS, **options)
 
 
 def test_a_rig_moves_along_its_front_cameras_lateral_axis():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparsestreet.evaluation.predictions import PredictionError, Predictions, quantized, restored
+from sparsestreet.evaluation.evaluate import PredictionError, Predictions, quantized, restored
 
 RGB = np.random.default_rng(0).random((9, 12, 3)).astype(np.float32)
 

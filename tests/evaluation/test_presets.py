@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
-from sparsestreet.evaluation import presets as presets_module
+from sparsestreet.data.lazy import as_frames
+from sparsestreet.evaluation import extra as presets_module
 from sparsestreet.evaluation.evaluate import evaluate_frames
-from sparsestreet.evaluation.presets import ROUNDS, evaluate_presets
+from sparsestreet.evaluation.extra import ROUNDS, evaluate_presets
 from sparsestreet.ops import SplatSettings
 from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.strict_json import RecordError
@@ -21,7 +21,7 @@ from tests.evaluation.scenes import OPTIONS, node_of, small_scene
 from tests.typed import there
 
 SCENE = small_scene()
-FRAMES = Frames.of((make_frame(0), make_frame(1, size=(11, 7))))
+FRAMES = as_frames((make_frame(0), make_frame(1, size=(11, 7))))
 COARSE = RenderOptions(SplatSettings(alpha_min=0.3))
 
 
@@ -64,7 +64,7 @@ def test_exact_goes_on_behind_what_is_all_but_opaque():
     stack = node_of([[0.0, 0.0, 2.0], [0.0, 0.0, 2.5]])
     with torch.no_grad():
         stack.rows.sh_dc[1] = 1.0
-    scene, frames = SceneGraph({"road": stack}), Frames.of((make_frame(),))
+    scene, frames = SceneGraph({"road": stack}), as_frames((make_frame(),))
     trained = replace(OPTIONS, settings=SplatSettings(transmittance_min=0.3))
     (rendered,) = evaluate_presets(scene, frames, {"early": trained}, trained, command="c").rendered
     early, late = (

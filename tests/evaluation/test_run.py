@@ -11,13 +11,10 @@ from PIL import Image
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.evaluation import run as run_module
-from sparsestreet.evaluation.evaluate import evaluate_predictions
-from sparsestreet.evaluation.node_costs import SceneCosts
-from sparsestreet.evaluation.predictions import PredictionError, Predictions
+from sparsestreet.evaluation.evaluate import PredictionError, Predictions, evaluate_predictions
 from sparsestreet.evaluation.run import evaluate_scene
-from sparsestreet.evaluation.speed import Timing
-from sparsestreet.metrics.lpips import ALEX
-from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
+from sparsestreet.evaluation.speed import SceneCosts, Timing
+from sparsestreet.metrics.lpips import ALEX, FOLDER_VARIABLE
 from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.pictures.images import picture_path
 from sparsestreet.records.costs import COSTS, NodeCost

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence.light import measured_light
 from sparsestreet.scene.effects import NightSettings, SaturationSettings, plan_effects
 from sparsestreet.types import Camera, Frame
@@ -22,7 +22,7 @@ def frames(level: float, noise: float = 0.0, white: float = 0.0) -> Frames:
         image[: round(white * HEIGHT) if index == 9 else 0] = 255.0
         camera = Camera(torch.eye(4), torch.eye(3), WIDTH, HEIGHT)
         made.append(Frame(camera, index / 9, index, 0, image=image.round().clamp(0, 255).byte()))
-    return Frames.of(made)
+    return as_frames(made)
 
 
 def test_level_and_noise_are_those_of_the_images():
@@ -45,16 +45,16 @@ def test_a_lamp_of_one_color_is_not_cut_off():
     red = [replace(frame, image=frame.image.clone()) for frame in frames(90)]
     for frame in red:
         frame.image[..., 0] = 255
-    assert measured_light(Frames.of(red)).clipped == 0
+    assert measured_light(as_frames(red)).clipped == 0
 
 
 def test_sky_and_car_do_not_count():
     top = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     top[:15] = True
     masked = [replace(frame, sky=top) for frame in frames(90, white=0.5)]
-    assert measured_light(Frames.of(masked)).clipped == 0
+    assert measured_light(as_frames(masked)).clipped == 0
     nothing = [replace(frame, sky=top, ego=~top) for frame in frames(5, white=0.5)]
-    assert measured_light(Frames.of(nothing)).level == 128
+    assert measured_light(as_frames(nothing)).level == 128
 
 
 @pytest.mark.parametrize(("level", "night"), [(118, False), (60, False), (30, True), (0, True)])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence import poses
 from sparsestreet.evidence.poses import PoseNoise, pose_noise
 from sparsestreet.geometry import quaternions as quat
@@ -46,7 +46,7 @@ def measured(
         image = torch.zeros(120, 200, 3, dtype=torch.uint8)
         frames.append(Frame(off(true_camera(instant, lens), motion), instant / 17, instant, 0, image=image))
     monkeypatch.setattr(poses, "street_points", lambda part, *_: seen_points(part, lens))
-    return pose_noise(Frames.of(frames), ())
+    return pose_noise(as_frames(frames), ())
 
 
 def seen_points(frames: Frames, lens: bool) -> StreetPoints:
@@ -110,7 +110,7 @@ def test_a_car_that_stands_says_nothing(monkeypatch: pytest.MonkeyPatch):
         return StreetPoints(nothing, {})
 
     monkeypatch.setattr(poses, "street_points", looked_at)
-    assert pose_noise(Frames.of(still), ()) is None
+    assert pose_noise(as_frames(still), ()) is None
 
 
 def test_pixels_of_the_recording_car_do_not_count(monkeypatch: pytest.MonkeyPatch):
@@ -126,5 +126,5 @@ def test_pixels_of_the_recording_car_do_not_count(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(poses, "street_points", looked_at)
     for known, wanted in ((None, hood), (sky, hood | sky)):
-        pose_noise(Frames.of([replace(frame, sky=known)]), ())
+        pose_noise(as_frames([replace(frame, sky=known)]), ())
         assert torch.equal(asked.pop(), wanted)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence.sky import sky_share
 from sparsestreet.scene.effects import SkySettings
 from tests.scene.street import street_log, training_data
@@ -18,7 +18,7 @@ def frames(*shares: float) -> Frames:
         height, width, _ = frame.image.shape
         mask = torch.arange(height * width).reshape(height, width) < share * height * width
         made.append(replace(frame, sky=mask))
-    return Frames.of(made)
+    return as_frames(made)
 
 
 def test_mean_and_error_are_over_images():
@@ -38,6 +38,6 @@ def test_a_tunnel_has_none(share: float, wanted: bool):
 
 def test_without_masks_there_is_a_sky():
     data = training_data()
-    assert sky_share(Frames.of([replace(frame, sky=None) for frame in data.frames])) is None
-    found = SkySettings().detect(replace(data, frames=Frames.of([replace(frame, sky=None) for frame in data.frames])))
+    assert sky_share(as_frames([replace(frame, sky=None) for frame in data.frames])) is None
+    found = SkySettings().detect(replace(data, frames=as_frames([replace(frame, sky=None) for frame in data.frames])))
     assert (found.called_for, found.value) == (True, None)

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.types import Camera, Frame, Sweep
 
 WIDTH, HEIGHT, FOCAL = 80, 40, 50.0
@@ -63,7 +63,7 @@ def sweeps(instants: range = range(INSTANTS)) -> Sweeps:
 
 
 def lazy(made: list[Frame]) -> Frames:
-    return Frames.of(made)
+    return as_frames(made)
 
 
 def random_gains(size: float, seed: int = 0) -> Float[Tensor, "i 2 3"]:

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph

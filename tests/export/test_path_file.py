@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sparsestreet.export.path_file import PathFile, read_path
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from tests.export.street import street_views
 from tests.typed import there
 

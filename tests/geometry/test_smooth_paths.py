@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.smooth_paths import smoothed
-from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.geometry.trajectories import Trajectories, smoothed
 
 COUNT = 30
 

@@ -6,7 +6,7 @@ import mmap
 import pytest
 import torch
 
-from sparsestreet.evaluation.memory import forget_peaks, peak_megabytes
+from sparsestreet.evaluation.speed import forget_peaks, peak_megabytes
 from sparsestreet.records.costs import COSTS, CostRecord, EffectGain, NodeCost, stage_costs, step_costs, update_costs
 from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
 from sparsestreet.records.strict_json import RecordError

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.metrics.definitions import DRIVESTUDIO
 from sparsestreet.records.novel import NOVEL
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import collect

@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
+from sparsestreet.metrics.definitions import DRIVESTUDIO, STRICT
 from sparsestreet.records.costs import NodeCost, update_costs
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.ledger import LEDGER, PRUNING, CountChange

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.metrics.definitions import DRIVESTUDIO
 from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms

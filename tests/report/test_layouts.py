@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.metrics.definitions import DEFINITIONS
-from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
+from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.failures import FailedRun
 from sparsestreet.records.quality import HELD_OUT, TRAINING, MetricSummary
 from sparsestreet.report.arms import Arm, arms

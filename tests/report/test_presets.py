@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
+from sparsestreet.metrics.definitions import DRIVESTUDIO, STRICT
 from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report import collect
 from sparsestreet.report.arms import arms

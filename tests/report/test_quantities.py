@@ -2,8 +2,7 @@
 
 import dataclasses
 
-from sparsestreet.metrics.definitions import DEFINITIONS
-from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
+from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.report import sections
 from tests.evaluation.frames import make_summary

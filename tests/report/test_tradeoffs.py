@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from sparsestreet.metrics.definitions import DEFINITIONS
-from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
+from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.report.arms import arms
 from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired

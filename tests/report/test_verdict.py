@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestreet.metrics.protocols import DRIVESTUDIO
+from sparsestreet.metrics.definitions import DRIVESTUDIO
 from sparsestreet.report.arms import arms
 from sparsestreet.report.verdict import verdict
 from tests.evaluation.frames import make_summary

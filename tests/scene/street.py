@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.geometry.transforms import inverse
 from sparsestreet.scene.assignment import assign_tracks
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.coverage import Coverage
@@ -258,7 +258,7 @@ def street_log(car_points: int = 60) -> DrivingLog:
     )
     return DrivingLog(
         name="hand-made",
-        frames=Frames.of([frame_at(index) for index in frames]),
+        frames=as_frames([frame_at(index) for index in frames]),
         sweeps=Sweeps.of(tuple(sweep_at(index, car_points) for index in frames)),
         tracks=tracks,
         num_frames=NUM_FRAMES,

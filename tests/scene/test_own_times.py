@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.quaternions import slerp
 from sparsestreet.scene.body.people import _filled
@@ -53,7 +53,7 @@ def own_log(*tracks: Track) -> DrivingLog:
         points[50:-1] = points[50:-1] @ moved[:3, :3].T + moved[:3, 3]
         sweeps.append(replace(sweep, time=(sweep.index + SWEEP) / LONG, points=points))
     tracks = tuple(map(timed, tracks or log.tracks))
-    return replace(log, frames=Frames.of(views), sweeps=Sweeps.of(tuple(sweeps)), tracks=tracks)
+    return replace(log, frames=as_frames(views), sweeps=Sweeps.of(tuple(sweeps)), tracks=tracks)
 
 
 def moved_car(frames: float) -> torch.Tensor:
@@ -129,7 +129,7 @@ def test_boxes_of_held_out_frames_place_no_return():
 def test_training_times_are_one_a_frame():
     log = own_log()
     second = [replace(frame, camera_index=1, time=frame.time + 0.1 / LONG) for frame in log.frames]
-    both = replace(log, frames=Frames.of([*second, *log.frames]))
+    both = replace(log, frames=as_frames([*second, *log.frames]))
     held_out = frozenset({1})
     assert training_data(both, held_out).times == [frame.time for frame in log.frames if frame.frame_index != 1]
 

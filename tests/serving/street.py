@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import write_views
 from sparsestreet.serving import wire

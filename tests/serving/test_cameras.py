@@ -5,8 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.geometry.cameras import project
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse, project
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import READ_FIRST, camera_spec, lens_of, matrix, pose_message, posed
 from sparsestreet.types import Camera

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.records.rig import RIG, RigRecord
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.rig import rig_of

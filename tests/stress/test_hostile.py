@@ -24,7 +24,7 @@ import torch
 from sparsestreet.data.images import image_size, read_image
 from sparsestreet.data.pandaset.frames import read_columns
 from sparsestreet.data.ply import read_ply
-from sparsestreet.evaluation.predictions import Predictions
+from sparsestreet.evaluation.evaluate import Predictions
 from sparsestreet.safe_npz import read_npz
 from sparsestreet.safe_pickle import read_pickled
 from sparsestreet.safe_yaml import read_yaml

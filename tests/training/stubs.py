@@ -11,7 +11,7 @@ from lightning import Callback, LightningDataModule, Trainer
 from torch import Tensor
 
 from sparsestreet.data.datamodule import OrderedFrames, StreetData
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import Split
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.records.ledger import CountChange
@@ -184,7 +184,7 @@ class StubTrainer(Trainer):
     ) -> None:
         # Not Lightning's __init__: nothing of its machinery is there.
         self.system, self.callbacks, self.max_steps = system, list(callbacks), max_steps
-        self.datamodule = SplitFrames(Split(Frames.of(train), Frames.of(held_out)))
+        self.datamodule = SplitFrames(Split(as_frames(train), as_frames(held_out)))
         self.callback_metrics = {}
         self.log_calls: list[tuple[str, float, dict[str, Any]]] = []
         system.trainer = self
@@ -258,7 +258,7 @@ class StubTrainer(Trainer):
 class _OneFrame(LightningDataModule):
     def __init__(self, frame: Frame) -> None:
         super().__init__()
-        self.frames = OrderedFrames(Frames.of((frame,)))
+        self.frames = OrderedFrames(as_frames((frame,)))
 
     def train_dataloader(self) -> OrderedFrames:
         return self.frames

@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import Split
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.scene.density import GradientDensity
@@ -65,8 +65,8 @@ def test_a_node_grows_to_its_limit_or_to_a_few_times_its_start():
 
 
 def test_moved_views_take_their_part_of_the_steps(monkeypatch):
-    frames = Frames.of([frame_at(index) for index in range(3)])
-    system, data = make_system({"background": background(20)}), SplitFrames(Split(frames, Frames.of(())))
+    frames = as_frames([frame_at(index) for index in range(3)])
+    system, data = make_system({"background": background(20)}), SplitFrames(Split(frames, as_frames(())))
     monkeypatch.setattr(forecast_module, "_seconds", lambda work, device: 2.0)
     assert measured_step(system, data) == 2.0 * OPTIMIZER
     one = Returns(torch.ones(1, 3), torch.ones(1, 3), torch.ones(1))
@@ -79,8 +79,8 @@ def test_moved_views_take_their_part_of_the_steps(monkeypatch):
 
 
 def test_trials_leave_no_trace():
-    frames = Frames.of([frame_at(index) for index in range(3)])
-    data = SplitFrames(Split(frames, Frames.of(())))
+    frames = as_frames([frame_at(index) for index in range(3)])
+    data = SplitFrames(Split(frames, as_frames(())))
     system = make_system({"background": background(20)})
     StubTrainer(system, max_steps=10)
     before = {name: value.clone() for name, value in system.state_dict().items()}

@@ -9,7 +9,7 @@ import torch
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.doubts import doubts
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.effects import EffectPlan, ExposureSettings
 from sparsestreet.scene.nodes import BackgroundSettings
@@ -36,13 +36,13 @@ def wall_log(gain: Callable[[int, int], torch.Tensor] = lambda instant, camera: 
         replace(frame, stamp=PERIOD * frame.indices[0], seconds=0.1 * frame.indices[0]) for frame in wall.frames(gain)
     ]
     return DrivingLog(
-        "wall", Frames.of(frames), wall.sweeps(), (box("car"),), wall.INSTANTS, 2, torch.eye(4, dtype=torch.float64)
+        "wall", as_frames(frames), wall.sweeps(), (box("car"),), wall.INSTANTS, 2, torch.eye(4, dtype=torch.float64)
     )
 
 
 def changed(change: Callable[[Frame], Frame], *tracks: Track) -> DrivingLog:
     log = wall_log()
-    return replace(log, frames=Frames.of([change(frame) for frame in log.frames]), tracks=(*log.tracks, *tracks))
+    return replace(log, frames=as_frames([change(frame) for frame in log.frames]), tracks=(*log.tracks, *tracks))
 
 
 def late(frame: Frame) -> Frame:

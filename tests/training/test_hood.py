@@ -16,8 +16,8 @@ from sparsestreet.training.losses import (
     OpacityEntropy,
     Photometric,
     SkyMask,
+    without_hood,
 )
-from sparsestreet.training.losses.hood import without_hood
 from tests.training.stubs import HEIGHT, WIDTH, StubTrainer, background, frame_at, make_system, rigid
 from tests.typed import there
 

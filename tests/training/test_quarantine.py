@@ -5,7 +5,7 @@ import logging
 import pytest
 import torch
 
-from sparsestreet.on_its_way import OnItsWay
+from sparsestreet.host_copy import HostCopy
 from sparsestreet.training import quarantine
 from sparsestreet.training.adam import RefusedRows, RowAdam
 from sparsestreet.training.callbacks import Checkpoints
@@ -113,7 +113,7 @@ class Late(torch.Tensor):
 
 
 def test_on_a_device_counts_are_read_one_step_later(monkeypatch):
-    monkeypatch.setattr(quarantine, "on_its_way", lambda values: OnItsWay(values.as_subclass(torch.Tensor), None))
+    monkeypatch.setattr(quarantine, "copy_to_host", lambda values: HostCopy(values.as_subclass(torch.Tensor), None))
     watched, parameter = Quarantine(), torch.zeros(50, 3)
 
     def late(count: int, step: int) -> None:

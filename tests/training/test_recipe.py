@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
 from sparsestreet.pruning import ImportanceRule
@@ -36,7 +36,7 @@ def test_every_part_reaches_the_scene_or_the_system(monkeypatch):
     given: list[tuple[Any, ...]] = []
     scene = SceneGraph({"background": background(3)})
     monkeypatch.setattr(recipe_module, "build_scene", lambda *args: given.append(args) or scene)
-    frames = Frames.of([frame_at(index) for index in range(7)])
+    frames = as_frames([frame_at(index) for index in range(7)])
     log = DrivingLog("seven", frames, Sweeps.of(()), (), 7, 1, torch.eye(4).double())
     data = StreetData(log, stride=3, offset=1, seed=8)
     parts = Recipe(

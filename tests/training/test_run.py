@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
@@ -52,7 +52,7 @@ TRAINER = partial(CPU_TRAINER, log_every_n_steps=2)
 
 def data() -> StreetData:
     """Five instants, of which 1 and 3 are held out."""
-    frames = Frames.of([frame_at(index) for index in range(5)])
+    frames = as_frames([frame_at(index) for index in range(5)])
     log = DrivingLog("five", frames, Sweeps.of(()), (), 5, 1, torch.eye(4).double())
     return StreetData(log, stride=2, offset=1)
 

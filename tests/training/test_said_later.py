@@ -6,18 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.on_its_way import OnItsWay, on_its_way
+from sparsestreet.host_copy import HostCopy, copy_to_host
 from sparsestreet.training import said_later
 from sparsestreet.training.said_later import SaidLater
 from tests.training.stubs import StubTrainer, background, make_system
 
 
 @dataclass(frozen=True)
-class Late(OnItsWay):
+class Late(HostCopy):
     """A copy that is never there by itself."""
 
     @property
-    def is_there(self) -> bool:
+    def ready(self) -> bool:
         return False
 
 
@@ -59,7 +59,7 @@ def test_what_is_on_its_way_is_not_the_newest(trainer: StubTrainer, monkeypatch:
     said.say(trainer, value(0.5), {})
     trainer.global_step += 1
     said.pass_on(trainer)
-    monkeypatch.setattr(said_later, "on_its_way", lambda values: Late(values, None))
+    monkeypatch.setattr(said_later, "copy_to_host", lambda values: Late(values, None))
     said.say(trainer, value(0.25), {})
     assert (said.is_there, said.newest) == (False, {"loss": 0.5})
 
@@ -82,6 +82,6 @@ def test_rows_are_written_before_what_follows_them(trainer: StubTrainer):
 
 
 def test_on_a_host_everything_is_there():
-    way = on_its_way(torch.tensor([1.0, 2.0]))
-    assert way.is_there
-    assert way.arrived().tolist() == [1.0, 2.0]
+    way = copy_to_host(torch.tensor([1.0, 2.0]))
+    assert way.ready
+    assert way.wait().tolist() == [1.0, 2.0]

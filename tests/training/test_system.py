@@ -123,7 +123,9 @@ def test_nodes_know_whether_they_are_trained():
 
 @torch.no_grad()  # as Lightning calls it
 def validate(trainer: StubTrainer, frame: Frame) -> None:
+    trainer.system.on_validation_epoch_start()
     trainer.system.validation_step(frame, 0)
+    trainer.system.on_validation_epoch_end()
 
 
 class Term:

@@ -21,7 +21,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import sparsestreet
-from sparsestreet.on_its_way import OnItsWay
+from sparsestreet.host_copy import HostCopy
 from sparsestreet.ops import backend, triton
 from sparsestreet.ops.triton import launch, rasterizer, screen
 from sparsestreet.training import finite, quarantine, said_later
@@ -181,25 +181,25 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
         return [40, 5, 0]
 
     @dataclass(frozen=True)
-    class Queued(OnItsWay):
+    class Queued(HostCopy):
         """A copy that has arrived once a later rendering has waited."""
 
         before: int = 0
 
         @property
-        def is_there(self) -> bool:
+        def ready(self) -> bool:
             return found.renderings > self.before
 
-        def arrived(self) -> Tensor:
-            if not self.is_there:
+        def wait(self) -> Tensor:
+            if not self.ready:
                 found.note("arrival")
             return self.values
 
-    def queued(values: Tensor) -> OnItsWay:
+    def queued(values: Tensor) -> HostCopy:
         return Queued(torch.zeros(values.shape), None, found.renderings)
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
         patch.setattr(screen, "wait_for", counted)
         for module in (finite, quarantine, said_later, screen):
-            patch.setattr(module, "on_its_way", queued)
+            patch.setattr(module, "copy_to_host", queued)
         yield found

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.triangulation import ImagePointSettings, StreetPoints, TriangulatedPoints, cache, cached_street_points
 from sparsestreet.types import Camera, Frame, Track
 
@@ -42,7 +42,7 @@ def made(monkeypatch):
 
 
 def _get(folder, frames=FRAMES, tracks=(TRACK,), **changes):
-    return cached_street_points(Frames.of(frames), tracks, ImagePointSettings(cache=folder, **changes))
+    return cached_street_points(as_frames(frames), tracks, ImagePointSettings(cache=folder, **changes))
 
 
 def test_points_are_read_back_as_they_were(tmp_path, made):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.data.synthetic.parts import BACKGROUND
-from sparsestreet.geometry.distortion import distort
+from sparsestreet.geometry.lenses import distort
 from sparsestreet.triangulation import ImagePointSettings, street_points
 from sparsestreet.triangulation.features import Features
 from sparsestreet.triangulation.street import _pixel, _rays, _sighting
@@ -130,7 +130,7 @@ def _projected(positions, view, track):
 
 def _changed(log, change, count=None):
     """The first frames of the log, each as ``change`` makes it."""
-    return Frames.of(tuple(change(frame) for frame in list(log.frames)[:count]))
+    return as_frames(tuple(change(frame) for frame in list(log.frames)[:count]))
 
 
 def _with_pose(frame, pose):
@@ -143,7 +143,7 @@ def test_a_standing_camera_and_one_that_turns_on_the_spot_give_nothing(street):
     assert len(street_points(still, [], SETTINGS).static) == 0
     turn = torch.eye(4)
     turn[:3, :3] = torch.linalg.matrix_exp(torch.tensor([[0.0, 0, 0.1], [0, 0, 0], [-0.1, 0, 0]]))
-    turned = Frames.of((first, _with_pose(first, turn @ first.camera.camera_from_world)))
+    turned = as_frames((first, _with_pose(first, turn @ first.camera.camera_from_world)))
     assert len(street_points(turned, [], SETTINGS).static) == 0
 
 

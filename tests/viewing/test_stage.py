@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.viewing.edit_state import EditState, Offset
 from sparsestreet.viewing.poses import eye_of, matrix, wxyz_of
 from sparsestreet.viewing.stage import Eye, RecordedCamera, Stage

@@ -8,7 +8,7 @@ import yaml
 from rich.console import Console
 
 from sparsestreet.cli.commands.options import run_command
-from sparsestreet.metrics.protocols import PROTOCOLS, Protocol
+from sparsestreet.metrics.definitions import PROTOCOLS, Protocol
 from sparsestreet.report import collect, figure, markdown, sections, tables
 from sparsestreet.report.arms import arms
 from sparsestreet.report.collect import keep_records

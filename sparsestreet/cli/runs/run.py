@@ -26,7 +26,7 @@ from sparsestreet.cli.process import is_worker_rank, keep_freed_memory
 from sparsestreet.cli.runs.devices import devices_of_job
 from sparsestreet.cli.runs.folder import lies_in, start_of, take_folder
 from sparsestreet.cli.runs.shared_prefix import moments_to_keep, start_from_trunk
-from sparsestreet.evaluation.memory import forget_peaks
+from sparsestreet.evaluation.speed import forget_peaks
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.training.callbacks import PhaseTimes
 from sparsestreet.training.run import build, fit, train

@@ -27,7 +27,7 @@ from sparsestreet.data.lidar import empty_notes
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.problems import LogError, fault
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 
 
@@ -118,7 +118,7 @@ def _driven(chosen: Selection, path: PosePath) -> PosePath:
     return PosePath(stamps, path.at(stamps))
 
 
-def _shots(chosen: Selection, mounts: Mapping[str, MountedCamera], path: PosePath) -> list[Shot]:
+def _shots(chosen: Selection, mounts: Mapping[str, MountedCamera], path: PosePath) -> list[RecordedImage]:
     """The images, each with the pose of its own stamp. All rows of one are exposed at once (the data set's guide)."""
     found = [
         (frame, camera, name, stamps[frame])
@@ -128,7 +128,7 @@ def _shots(chosen: Selection, mounts: Mapping[str, MountedCamera], path: PosePat
     taken = [(frame, camera, name, stamp) for frame, camera, name, stamp in found if stamp is not None]
     poses = path.at(torch.tensor([stamp for *_, stamp in taken]))
     return [
-        Shot(
+        RecordedImage(
             frame=frame,
             camera=camera,
             world_from_camera=pose @ mounts[name].ego_from_camera,
@@ -156,12 +156,12 @@ def _boxes(chosen: Selection, path: PosePath) -> tuple[list[Boxes] | None, int]:
     return read_boxes(chosen.layout, list(chosen.sweeps), frames, path)
 
 
-def _read_image(rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
+def _read_image(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
     return read_image(Path(str(shot.key)), rig[shot.camera].size)
 
 
 def _read_masks(
-    rig: Sequence[RigCamera[str]], mounts: Mapping[str, MountedCamera], given: GivenMasks | None, shot: Shot
+    rig: Sequence[RigCamera[str]], mounts: Mapping[str, MountedCamera], given: GivenMasks | None, shot: RecordedImage
 ) -> dict[str, Bool[Tensor, "h w"]]:
     """Rows of the own car, and what somebody made, which counts where both are."""
     camera = rig[shot.camera]

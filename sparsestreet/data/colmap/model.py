@@ -16,8 +16,8 @@ from sparsestreet.data.posed_images import PosedImage
 from sparsestreet.data.problems import LogError, attempt, fault
 from sparsestreet.data.window import listed
 from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.lenses import Lens
-from sparsestreet.geometry.transforms import inverse
 
 _PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
 _LARGEST_IMAGE = 100_000

@@ -15,7 +15,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.stamps import box_stamps, frame_stamps
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import BodyPoses, Track
 
 ROUNDING = 1000

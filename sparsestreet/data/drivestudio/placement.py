@@ -14,7 +14,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.poses import AHEAD_FROM_OPENCV
 from sparsestreet.data.stamps import frame_stamps
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import View
 
 WrittenFlavor = Literal["auto", "waymo", "nuscenes"]

@@ -19,7 +19,7 @@ from sparsestreet.data.drivestudio.layout import Layout, find_layout
 from sparsestreet.data.drivestudio.poses import first_pose, read_clock, read_vehicle
 from sparsestreet.data.drivestudio.sweeps import read_points, sweep_notes
 from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.kept_frames import CacheSize, cache_bytes
+from sparsestreet.data.frame_cache import CacheSize, cache_bytes
 from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.notes import absence_notes

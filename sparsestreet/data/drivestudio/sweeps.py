@@ -13,7 +13,7 @@ from sparsestreet.data.drivestudio.layout import Layout
 from sparsestreet.data.drivestudio.poses import read_pose
 from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.problems import fault
-from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.geometry.cameras import transform_points
 
 _REMEDY = "drop these returns, and make sure that the rows have the flavor's columns"
 

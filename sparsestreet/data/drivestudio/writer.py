@@ -20,7 +20,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.mask_kinds import find_masks
 from sparsestreet.data.poses import AHEAD_FROM_OPENCV
 from sparsestreet.data.stamps import frame_stamps, seconds_lines
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import View
 
 _FLOW_CLASS = 9

@@ -12,7 +12,7 @@ from torch import Tensor
 from sparsestreet.data.kitti.text import keyed_numbers, read_keyed
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 
 _REMEDY = "copy the calibration of this date again from the published archive"
 

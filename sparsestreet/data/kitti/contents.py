@@ -11,7 +11,7 @@ from torch import Tensor
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import image_size, read_image
 from sparsestreet.data.problems import Problem, attempt, fault
-from sparsestreet.data.recording import Recording, Shot
+from sparsestreet.data.recording import RecordedImage, Recording
 from sparsestreet.data.rig import RigCamera
 
 Masks = Mapping[str, Bool[Tensor, "h w"]]
@@ -25,15 +25,15 @@ class Pixels:
     recorded_sizes: tuple[tuple[int, int], ...]
     """(width, height) that each camera's calibration has."""
     given: GivenMasks | None = None
-    shipped: Callable[[Shot], Masks] | None = None
+    shipped: Callable[[RecordedImage], Masks] | None = None
     """Masks of the data set itself; those that are given replace them kind by kind."""
 
-    def image(self, shot: Shot) -> UInt8[Tensor, "h w 3"]:
+    def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
         path, camera = Path(str(shot.key)), self.rig[shot.camera]
         check_size(path, self.recorded_sizes[shot.camera])
         return read_image(path, camera.size, camera.undistortion)
 
-    def masks(self, shot: Shot) -> Masks:
+    def masks(self, shot: RecordedImage) -> Masks:
         camera = self.rig[shot.camera]
         masks = {} if self.shipped is None else dict(self.shipped(shot))
         if self.given is not None:

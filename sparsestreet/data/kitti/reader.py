@@ -24,8 +24,8 @@ from sparsestreet.data.kitti.velodyne import point_stamps, read_points
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
-from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.geometry.cameras import transform_points
 
 _POSES = "poses are those of GPS and IMU, as shipped: where they err, images and lidar of different frames disagree"
 
@@ -149,13 +149,13 @@ def _read_poses(drive: Drive, problems: list[Problem]) -> tuple[dict[int, Oxts],
     return oxts, {frame: one.world_from_imu(scale) for frame, one in oxts.items() if frame in drive.frames}
 
 
-def _shots(drive: Drive, parts: _Parts) -> list[Shot]:
+def _shots(drive: Drive, parts: _Parts) -> list[RecordedImage]:
     shots = []
     for place, frame in enumerate(drive.frames):
         for index, name in enumerate(drive.cameras):
             pose = parts.poses[frame] @ parts.calibration.imu_from_camera[name]
             path = drive.image(name, frame)
-            shots.append(Shot(place, index, pose, path, path.stem, parts.clock.stamps[place]))
+            shots.append(RecordedImage(place, index, pose, path, path.stem, parts.clock.stamps[place]))
     return shots
 
 

@@ -16,7 +16,7 @@ from sparsestreet.data.kitti360.fisheye import FisheyeCamera, read_fisheye
 from sparsestreet.data.kitti360.layout import FISHEYE
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 
 _REMEDY = "copy it again from the published archive"
 

@@ -27,9 +27,9 @@ from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.poses import RIGIDITY_TOLERANCE, are_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, lens_camera
-from sparsestreet.geometry.transforms import rigidity_error, transform_points
+from sparsestreet.geometry.cameras import rigidity_error, transform_points
 
 _TURN = 103_300_000
 """Nanoseconds of the lidar's turn, where the stamps of the images do not tell."""
@@ -197,14 +197,14 @@ def _path(
     return PosePath(torch.tensor(stamps), torch.stack(taken), max_extrapolation=turn)
 
 
-def _shots(sequence: SequenceFolders, parts: _Parts) -> list[Shot]:
+def _shots(sequence: SequenceFolders, parts: _Parts) -> list[RecordedImage]:
     shots = []
     poses = parts.path.at(torch.tensor(parts.stamps))
     for place, frame in enumerate(parts.frames):
         for index, name in enumerate(sequence.cameras):
             pose = poses[place] @ parts.calibration.imu_from_camera[name]
             path = sequence.image(name, frame)
-            shots.append(Shot(place, index, pose, path, path.stem, parts.stamps[place]))
+            shots.append(RecordedImage(place, index, pose, path, path.stem, parts.stamps[place]))
     return shots
 
 
@@ -240,7 +240,7 @@ def _labels(
     rig: tuple[RigCamera[str], ...],
     sizes: tuple[tuple[int, int], ...],
     labeled: set[tuple[str, Path]],
-    shot: Shot,
+    shot: RecordedImage,
 ) -> Masks:
     camera = rig[shot.camera]
     path = sequence.semantics(camera.name) / f"{shot.stem}.png"

@@ -11,7 +11,7 @@ from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import image_size, read_image
 from sparsestreet.data.nuscenes.cameras import ego_mask
 from sparsestreet.data.problems import fault
-from sparsestreet.data.recording import Shot
+from sparsestreet.data.recording import RecordedImage
 from sparsestreet.data.rig import RigCamera
 
 
@@ -31,12 +31,12 @@ class ScenePixels:
         ego = frozenset({"ego"} if any(ego_mask(self.scene, camera) is not None for camera in self.rig) else ())
         return ego if self.given is None else ego | self.given.kinds
 
-    def image(self, shot: Shot) -> UInt8[Tensor, "h w 3"]:
+    def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
         path = Path(str(shot.key))
         check_size(path, self.recorded_sizes[shot.camera])
         return read_image(path, self.rig[shot.camera].size)
 
-    def masks(self, shot: Shot) -> dict[str, Bool[Tensor, "h w"]]:
+    def masks(self, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
         """Those that somebody made; the rows of the recording car where they have none of it."""
         camera = self.rig[shot.camera]
         ego = ego_mask(self.scene, camera)

@@ -24,7 +24,7 @@ from sparsestreet.data.nuscenes.scene import LIDAR
 from sparsestreet.data.nuscenes.selection import Selection, select
 from sparsestreet.data.nuscenes.sweeps import read_sweep
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 
 
@@ -162,9 +162,9 @@ class NuScenesReader(RecordedReader):
         return read_boxes(chosen.scene, chosen.annotations, frames)
 
 
-def _shots(chosen: Selection) -> list[Shot]:
+def _shots(chosen: Selection) -> list[RecordedImage]:
     return [
-        Shot(
+        RecordedImage(
             frame=frame,
             camera=camera,
             world_from_camera=chosen.world_from_sensor(file),
@@ -176,6 +176,6 @@ def _shots(chosen: Selection) -> list[Shot]:
     ]
 
 
-def _placed(shots: Sequence[Shot], boxes: Sequence[Boxes]) -> list[tuple[Path, Tensor]]:
+def _placed(shots: Sequence[RecordedImage], boxes: Sequence[Boxes]) -> list[tuple[Path, Tensor]]:
     placed = [(Path(str(shot.key)), shot.world_from_camera[:3, 3]) for shot in shots]
     return placed + [(box.path, torch.from_numpy(position)) for box in boxes for position in box.poses[:, :3, 3]]

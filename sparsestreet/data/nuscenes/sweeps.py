@@ -10,7 +10,7 @@ from torch import Tensor
 from sparsestreet.atomic import check_regular
 from sparsestreet.data.lidar import check_points
 from sparsestreet.data.problems import fault
-from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.geometry.cameras import transform_points
 
 COLUMNS = 5
 """float32: x, y, z in meters, intensity, ring."""

@@ -13,7 +13,7 @@ from sparsestreet.data.pandaset.spin import Spin
 from sparsestreet.data.pandaset.tables import PER_SECOND, Cuboids, read_cuboids
 from sparsestreet.data.problems import LogError, Problem, attempt
 from sparsestreet.data.recording import Boxes
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR, EGO_ROWS, FRONT
 from sparsestreet.data.pandaset.spin import Spin, spin_of
 from sparsestreet.data.pandaset.tables import PER_SECOND, read_intrinsics, read_poses, read_returns, read_stamps
 from sparsestreet.data.problems import LogError, Problem, fault, missing_files
-from sparsestreet.data.recording import LidarSweep, RecordedReader, Recording, Shot
+from sparsestreet.data.recording import LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.window import chosen_cameras, frame_window
 
@@ -154,9 +154,9 @@ def _placed(chosen: _Selection, name: str) -> tuple[list[int], Float64[Tensor, "
     return stamps, poses
 
 
-def _shots(chosen: _Selection, placed: Mapping[str, tuple[list[int], Float64[Tensor, "n 4 4"]]]) -> list[Shot]:
+def _shots(chosen: _Selection, placed: Mapping[str, tuple[list[int], Float64[Tensor, "n 4 4"]]]) -> list[RecordedImage]:
     return [
-        Shot(
+        RecordedImage(
             frame=index,
             camera=camera,
             world_from_camera=placed[name][1][frame],
@@ -170,7 +170,7 @@ def _shots(chosen: _Selection, placed: Mapping[str, tuple[list[int], Float64[Ten
 
 
 def _check_places(
-    chosen: _Selection, rig: Sequence[RigCamera[str]], shots: Sequence[Shot], objects: Objects | None
+    chosen: _Selection, rig: Sequence[RigCamera[str]], shots: Sequence[RecordedImage], objects: Objects | None
 ) -> list[Problem]:
     """Whether images and boxes lie within one scene."""
     placed = [
@@ -185,11 +185,13 @@ def _points(path: Path, world_from_lidar: Float64[Tensor, "4 4"]) -> Float64[Ten
     return read_returns(path, world_from_lidar).world
 
 
-def _read_image(rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
+def _read_image(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
     return read_image(Path(str(shot.key)), rig[shot.camera].size)
 
 
-def _read_masks(rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: Shot) -> dict[str, Bool[Tensor, "h w"]]:
+def _read_masks(
+    rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: RecordedImage
+) -> dict[str, Bool[Tensor, "h w"]]:
     """Rows of the own car, and what somebody made, which counts where both are."""
     camera = rig[shot.camera]
     own = {"ego": bottom_rows(camera.size, *EGO_ROWS[camera.name])} if camera.name in EGO_ROWS else {}

@@ -18,7 +18,7 @@ from sparsestreet.data.pandaset.frames import read_columns
 from sparsestreet.data.pandaset.layout import OWN_CAR
 from sparsestreet.data.poses import rigid_poses
 from sparsestreet.data.problems import fault
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 
 PER_SECOND = 1_000_000_000
 _LARGEST_JSON = 16_000_000

@@ -12,7 +12,7 @@ from torch import Tensor
 from sparsestreet.data.given_masks import GivenMasks
 from sparsestreet.data.images import read_image, read_mask
 from sparsestreet.data.motion import PosePath
-from sparsestreet.data.recording import Boxes, LidarSweep, Shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.data.rig_json.sweeps import read_sweep
 from sparsestreet.data.rig_json.table import CameraEntry, FrameEntry, ImageEntry, RigTable
@@ -44,7 +44,7 @@ class Part:
         """At the frames of the window; None: without a clock, or without poses."""
         return _drive(self.frames)
 
-    def shots(self) -> list[Shot]:
+    def shots(self) -> list[RecordedImage]:
         drive = _drive(self.table.frames)
         return [
             _shot(self.table, drive, entry, frame, index, name)
@@ -53,7 +53,7 @@ class Part:
             if name in entry.images
         ]
 
-    def sweeps(self, shots: Sequence[Shot]) -> dict[int, LidarSweep] | None:
+    def sweeps(self, shots: Sequence[RecordedImage]) -> dict[int, LidarSweep] | None:
         """Of the frames that have one; None: no frame of the table has."""
         if not any(frame.sweep for frame in self.table.frames):
             return None
@@ -83,7 +83,9 @@ class Part:
         return found
 
 
-def _shot(table: RigTable, drive: PosePath | None, entry: FrameEntry, frame: int, index: int, name: str) -> Shot:
+def _shot(
+    table: RigTable, drive: PosePath | None, entry: FrameEntry, frame: int, index: int, name: str
+) -> RecordedImage:
     image, mount = entry.images[name], table.cameras[name].vehicle_from_camera
     stamp = entry.stamp if image.stamp is None else image.stamp
     pose = image.world_from_camera
@@ -99,7 +101,7 @@ def _shot(table: RigTable, drive: PosePath | None, entry: FrameEntry, frame: int
                 raise image.where.fault(f"has no pose: {error}", remedy) from error
     shutter = _shutter(table.cameras[name], drive, image, stamp)
     exposure = table.cameras[name].exposure
-    return Shot(frame, index, pose, image, image.path.stem, stamp, shutter, exposure)
+    return RecordedImage(frame, index, pose, image, image.path.stem, stamp, shutter, exposure)
 
 
 def _shutter(camera: CameraEntry, drive: PosePath | None, image: ImageEntry, stamp: int | None) -> Shutter | None:
@@ -131,13 +133,13 @@ def _drive(frames: Sequence[FrameEntry]) -> PosePath | None:
     return PosePath(torch.tensor(stamps), torch.stack([pose for _, pose in known]), max_extrapolation=step)
 
 
-def read_pixels(rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
+def read_pixels(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
     camera = rig[shot.camera]
     return read_image(entry_of(shot).path, camera.size, camera.undistortion)
 
 
 def read_masks(
-    table: RigTable, rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: Shot
+    table: RigTable, rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: RecordedImage
 ) -> dict[str, Bool[Tensor, "h w"]]:
     camera = rig[shot.camera]
     entry, lens = table.cameras[camera.name], camera.undistortion
@@ -150,6 +152,6 @@ def read_masks(
     return masks
 
 
-def entry_of(shot: Shot) -> ImageEntry:
+def entry_of(shot: RecordedImage) -> ImageEntry:
     assert isinstance(shot.key, ImageEntry)
     return shot.key

@@ -12,7 +12,7 @@ from sparsestreet.data.images import check_camera_images, check_image_sizes
 from sparsestreet.data.lidar import empty_notes
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_files, missing_notes
-from sparsestreet.data.recording import RecordedReader, Recording, Shot
+from sparsestreet.data.recording import RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.rig_json.part import Part, entry_of, read_masks, read_pixels
 from sparsestreet.data.rig_json.sweeps import read_rows
@@ -102,7 +102,7 @@ class RigJsonReader(RecordedReader):
             pinhole_fov=self.pinhole_fov,
         )
 
-    def _problems(self, part: Part, shots: Sequence[Shot], *, decode: bool) -> list[Problem]:
+    def _problems(self, part: Part, shots: Sequence[RecordedImage], *, decode: bool) -> list[Problem]:
         problems = missing_files(_recorded(part))
         for index, name in enumerate(part.cameras):
             images = [entry_of(shot).path for shot in shots if shot.camera == index]

@@ -13,7 +13,7 @@ from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.problems import fault
 from sparsestreet.data.rig_json.table import FrameEntry, LidarEntry
-from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.geometry.cameras import transform_points
 
 _BIN = ("x", "y", "z", "intensity")
 _LONGEST_SWEEP = 1.0

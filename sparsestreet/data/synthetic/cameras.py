@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from sparsestreet.data.synthetic.parts import Pose, at
 from sparsestreet.data.synthetic.settings import CAMERA_YAWS_DEGREES, StreetSettings
 from sparsestreet.data.synthetic.tracer import Rays
-from sparsestreet.geometry.distortion import undistort
+from sparsestreet.geometry.lenses import undistort
 
 _EGO_AXES_FROM_CAMERA = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], np.float64)
 """Columns are camera x (right), y (down), z (forward) in ego axes (x forward, y left, z up)."""

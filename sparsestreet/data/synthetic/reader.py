@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.kept_frames import CacheSize
+from sparsestreet.data.frame_cache import CacheSize
 from sparsestreet.data.log import DrivingLog, SceneExtent
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader

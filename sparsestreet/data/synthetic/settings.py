@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import torch
 
 from sparsestreet.data.synthetic.sensor import WAYMO_TOP, LidarSensor
-from sparsestreet.geometry.distortion import fold_radius_squared, undistort
+from sparsestreet.geometry.lenses import fold_radius_squared, undistort
 from sparsestreet.types import Side
 
 CAMERA_YAWS_DEGREES = (0.0, 50.0, -50.0)

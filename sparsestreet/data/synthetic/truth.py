@@ -17,7 +17,7 @@ from sparsestreet.data.synthetic.render import developed
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.world import World, build_world
 from sparsestreet.data.synthetic.write import HUMAN_CLASSES, VEHICLE_CLASSES
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Camera, Frame, View
 
 

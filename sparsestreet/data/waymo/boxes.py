@@ -17,8 +17,8 @@ from sparsestreet.data.recording import Boxes
 from sparsestreet.data.waymo.images import camera_at, middle, readout
 from sparsestreet.data.waymo.lidar import crossing
 from sparsestreet.data.waymo.segment import CLASSES, REMEDY, BoxLabel, CameraCalibration, ImageMotion, Segment
-from sparsestreet.geometry.distortion import distort
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
+from sparsestreet.geometry.lenses import distort
 
 _SIGN = 3
 _NEAR = 0.2

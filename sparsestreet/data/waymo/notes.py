@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from sparsestreet.data.recording import Shot
+from sparsestreet.data.recording import RecordedImage
 from sparsestreet.data.waymo.segment import Segment
 
 _ORDERS = {
@@ -19,7 +19,7 @@ def segment_notes(
     segment: Segment,
     frames: range,
     cameras: Sequence[str],
-    shots: Sequence[Shot],
+    shots: Sequence[RecordedImage],
     num_labelled: int,
 ) -> tuple[str, ...]:
     """One sentence each: the shutter's direction, labels made by hand, and images and sweeps that are missing."""

@@ -17,7 +17,7 @@ from sparsestreet.data.lidar import check_points
 from sparsestreet.data.marks import Marks
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, Shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import read_boxes
 from sparsestreet.data.waymo.find import find_segment
@@ -73,7 +73,7 @@ class WaymoReader(RecordedReader):
             notes=(*segment_notes(segment, frames, cameras, shots, len(labelled)), *notes),
         )
 
-    def _placed(self) -> tuple[list[Shot], list[Boxes] | None, tuple[str, ...]]:
+    def _placed(self) -> tuple[list[RecordedImage], list[Boxes] | None, tuple[str, ...]]:
         """Images, boxes, and what has to be said about these. Raises LogError with all that is wrong with them."""
         segment, frames, problems = self._segment, self._frames, []
         motions = {frame: attempt(problems, partial(segment.images, frame)) or {} for frame in frames}
@@ -163,7 +163,7 @@ def _instant(segment: Segment, frame: int) -> int:
 
 def _shots(
     segment: Segment, frames: range, cameras: Sequence[str], motions: Mapping[int, Mapping[str, ImageMotion]]
-) -> list[Shot]:
+) -> list[RecordedImage]:
     shots = []
     for index, frame in enumerate(frames):
         for place, name in enumerate(cameras):
@@ -172,7 +172,7 @@ def _shots(
             motion, calibration = motions[frame][name], segment.cameras[name]
             stamp = middle(motion)
             shots.append(
-                Shot(
+                RecordedImage(
                     index,
                     place,
                     camera_at(motion, calibration, stamp),
@@ -186,7 +186,7 @@ def _shots(
     return shots
 
 
-def _read_image(segment: Segment, rig: Sequence[RigCamera[str]], shot: Shot) -> UInt8[Tensor, "h w 3"]:
+def _read_image(segment: Segment, rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
     camera = rig[shot.camera]
     frame = int(shot.stem)
     data, recorded = segment.jpeg(frame, camera.name), segment.cameras[camera.name].size
@@ -198,7 +198,7 @@ def _read_masks(
     rig: Sequence[RigCamera[str]],
     labelled: frozenset[tuple[int, str]],
     given: GivenMasks | None,
-    shot: Shot,
+    shot: RecordedImage,
 ) -> Mapping[str, Bool[Tensor, "h w"]]:
     """Those that somebody made for all images, or else those that Waymo had made for some."""
     camera, frame = rig[shot.camera], int(shot.stem)

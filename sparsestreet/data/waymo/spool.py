@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from pathlib import Path
 from typing import BinaryIO
 
-from sparsestreet.data.lock import Lock
+from sparsestreet.data.frame_cache import Lock
 from sparsestreet.data.problems import fault
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sparsestreet.geometry.cameras import exact_position
-from sparsestreet.geometry.distortion import fold_radius_squared
+from sparsestreet.geometry.lenses import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import PairLimitError, Raster

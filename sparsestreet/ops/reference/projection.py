@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import exact_position
-from sparsestreet.geometry.distortion import distort, distortion_jacobian, fold_radius_squared
+from sparsestreet.geometry.lenses import distort, distortion_jacobian, fold_radius_squared
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.spherical_harmonics import view_colors

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.on_its_way import OnItsWay, on_its_way
+from sparsestreet.host_copy import HostCopy, copy_to_host
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.lists import (
     PAIR_LIMIT,
@@ -78,7 +78,7 @@ def draw(
     room = predicted(place, rows, PAIR_LIMIT)
     if room is not None:
         visible = list_visible_rows(projection, room, view)
-        counted = on_its_way(visible.sizes.on_device)
+        counted = copy_to_host(visible.sizes.on_device)
         screen = list_in(room, projection, visible, view)
         layers = work(screen)
         read(visible.sizes, counted, gaussians, projection)
@@ -118,7 +118,7 @@ def list_exactly(gaussians: Gaussians, projection: Projection, view: KernelView)
     """Lists what is visible, in no more room than that takes: waits for its size."""
     visible = list_visible_rows(projection, Room(len(gaussians), PAIR_LIMIT), view)
     sizes = visible.sizes
-    read(sizes, on_its_way(sizes.on_device), gaussians, projection)
+    read(sizes, copy_to_host(sizes.on_device), gaussians, projection)
     return list_in(Room(sizes.rows, sizes.pairs), projection, visible, view)
 
 
@@ -131,12 +131,12 @@ def list_in(room: Room, projection: Projection, visible: Visible, view: KernelVi
     return Screen(p.table, p.records, p.tile_counts, p.radii, list_tiles(p.records, visible, room, view), p.gated)
 
 
-def wait_for(numbers: OnItsWay) -> list[int]:
+def wait_for(numbers: HostCopy) -> list[int]:
     """The numbers, once they are there. Only here does the op wait for the device."""
-    return numbers.arrived().tolist()
+    return numbers.wait().tolist()
 
 
-def read(sizes: Sizes, counted: OnItsWay, gaussians: Gaussians, projection: Projection) -> None:
+def read(sizes: Sizes, counted: HostCopy, gaussians: Gaussians, projection: Projection) -> None:
     """Waits for the sizes; raises what ``project`` raises."""
     pairs, rows, bad = wait_for(counted)[:COUNTED]
     if bad:

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import exact_position, numbers_of
-from sparsestreet.geometry.distortion import fold_radius_squared
+from sparsestreet.geometry.lenses import fold_radius_squared
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton.launch import constant, jit, stream_of
 from sparsestreet.ops.triton.quaternions import times

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.evidence.boxes import box_jitter
-from sparsestreet.geometry.displacement import displacement
+from sparsestreet.geometry.boxes import displacement
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node

@@ -16,9 +16,8 @@ from torch import Tensor, nn
 
 from sparsestreet.evidence.poses import pose_noise, seen_from
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.boxes import without_frames
+from sparsestreet.geometry.boxes import displacement, without_frames
 from sparsestreet.geometry.cameras import exact_position
-from sparsestreet.geometry.displacement import displacement
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.effects.recorded_poses import RecordedPoses
 from sparsestreet.scene.initialize.training_data import TrainingData

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sparsestreet.evidence.blur import blur_length, exposure_motions
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Exposed, Finding, Moment
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.types import Camera, Shutter, View

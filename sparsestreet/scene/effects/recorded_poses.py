@@ -13,9 +13,8 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.smooth_paths import smoothed
-from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
+from sparsestreet.geometry.trajectories import Trajectories, smoothed
 from sparsestreet.types import View
 
 Neighbors = tuple[int, int, float]

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from sparsestreet.geometry.boxes import box_at, inside_box
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.scene.initialize.points import Points
 from sparsestreet.types import Sweep, Track
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from sparsestreet.geometry.displacement import displacement
+from sparsestreet.geometry.boxes import displacement
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.density import DensityStrategy

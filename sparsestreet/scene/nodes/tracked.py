@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import view_lag, without_frames
-from sparsestreet.geometry.smooth_paths import smoothed
-from sparsestreet.geometry.trajectories import Trajectories
+from sparsestreet.geometry.trajectories import Trajectories, smoothed
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
 from sparsestreet.scene.gaussians import Rows

@@ -5,8 +5,7 @@ from collections.abc import Mapping
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.registration import EdgeShift, edge_shift
-from sparsestreet.geometry.boxes import without_frames
-from sparsestreet.geometry.displacement import displacement
+from sparsestreet.geometry.boxes import displacement, without_frames
 from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import assign_tracks
 from sparsestreet.scene.nodes import NodeSettings, RigidSettings

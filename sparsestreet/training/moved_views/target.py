@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from sparsestreet.geometry.cameras import project
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.types import Camera
 
 NEAREST, FARTHEST = 0.5, 80.0

@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.geometry.cameras import distance_to_view, moved, resized
-from sparsestreet.geometry.transforms import transform_points
+from sparsestreet.geometry.cameras import distance_to_view, moved, resized, transform_points
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering, from_another_camera

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.data.argoverse2 import Argoverse2Reader
-from sparsestreet.geometry.cameras import project
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse, project
 from tests.data.argoverse2.write import CAMERAS, LOG, write_log
 from tests.typed import there
 

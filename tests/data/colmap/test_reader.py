@@ -12,8 +12,8 @@ from sparsestreet.data.colmap.model import find_model, read_images, read_points
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.posed_images import sort_images
 from sparsestreet.data.problems import LogError
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye, Lens, Rational
-from sparsestreet.geometry.transforms import inverse
 from tests.conftest import unchecked
 from tests.data.colmap.write import UNIT, Tables, tables, write_binary, write_colmap, write_images, write_text
 from tests.data.plan import Plan

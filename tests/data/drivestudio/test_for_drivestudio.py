@@ -18,7 +18,7 @@ from PIL import Image
 
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.data.roles import role_of
 from sparsestreet.geometry import quaternions as quat
@@ -106,7 +106,7 @@ def crooked(flavor: str, classes: tuple[str, ...] | None = None) -> DrivingLog:
     tracks = tuple(track(number, name, 1 if name == classes[-1] else 4) for number, name in enumerate(classes))
     path = VehiclePath(from_dataset(PLAN.world_from_vehicle(STAMPS)), tuple(STAMPS.tolist()))
     return DrivingLog(
-        "crooked", Frames.of(frames), Sweeps.of(sweeps), tracks, 5, 2, torch.from_numpy(WORLD), vehicle=path,
+        "crooked", as_frames(frames), Sweeps.of(sweeps), tracks, 5, 2, torch.from_numpy(WORLD), vehicle=path,
         camera_names=NAMES[flavor],
     )  # fmt: skip
 
@@ -297,7 +297,7 @@ def differences(log: DrivingLog, back: DrivingLog) -> set[str]:
 
 
 def with_frames(log: DrivingLog, change: Any) -> DrivingLog:
-    return replace(log, frames=Frames.of([change(frame) for frame in log.frames]))
+    return replace(log, frames=as_frames([change(frame) for frame in log.frames]))
 
 
 def plain(log: DrivingLog) -> DrivingLog:

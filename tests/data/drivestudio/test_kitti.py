@@ -10,7 +10,7 @@ import torch
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import Frame
 
 pytestmark = pytest.mark.lengthy

@@ -15,7 +15,7 @@ from sparsestreet.cli.config.compose import CONF
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
 from sparsestreet.data.drivestudio.classes import KNOWN, class_in
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
 from sparsestreet.types import Frame, Shutter, SparsePoints
@@ -220,7 +220,7 @@ def test_a_quality_is_one_of_jpegs(quality):
 
 
 def changed(log: DrivingLog, change: Callable[[Frame], Frame]) -> DrivingLog:
-    return replace(log, frames=Frames.of([change(frame) for frame in log.frames]))
+    return replace(log, frames=as_frames([change(frame) for frame in log.frames]))
 
 
 def with_shutter(frame: Frame) -> Frame:

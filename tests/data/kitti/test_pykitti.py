@@ -9,7 +9,7 @@ import pytest
 from sparsestreet.data.kitti import KittiReader
 from sparsestreet.data.kitti.calibration import read_calibration
 from sparsestreet.data.kitti.velodyne import OWN_CAR
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from tests.data.kitti.write import DATE, DRIVE, RECTIFIED_PLACES, write_kitti
 from tests.data.plan import Plan
 from tests.shared import made_once

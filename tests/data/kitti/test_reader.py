@@ -11,7 +11,7 @@ from sparsestreet.data.kitti import KittiReader
 from sparsestreet.data.kitti.velodyne import point_stamps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import Recording
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from tests.data.kitti.write import CAMERAS, DRIVE, lidar_from_camera, write_kitti
 from tests.data.plan import Plan, moved, pose, turned
 from tests.shared import made_once

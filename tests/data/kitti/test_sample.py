@@ -16,7 +16,7 @@ from sparsestreet.data.kitti.tracklets import Tracklet, read_tracklets
 from sparsestreet.data.kitti.velodyne import point_stamps, read_points
 from sparsestreet.data.motion import untwisted
 from sparsestreet.data.recording import Recording
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 
 DRIVE = "2011_09_26_drive_0005"
 

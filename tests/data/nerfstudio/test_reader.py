@@ -13,8 +13,8 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nerfstudio import NerfstudioReader
 from sparsestreet.data.problems import LogError, check_missing
 from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye
-from sparsestreet.geometry.transforms import inverse
 from tests.data.nerfstudio.write import UNIT, points_of, write_json, write_nerfstudio
 from tests.data.plan import Plan
 from tests.shared import made_once

@@ -8,7 +8,7 @@ from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
 from sparsestreet.data.recording import Recording
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.geometry.cameras import inverse, transform_points
 from tests.data.nuscenes.keyframe import summary_of, write_keyframe
 from tests.data.nuscenes.written import token
 from tests.typed import there

@@ -17,7 +17,7 @@ from sparsestreet.data.synthetic.shapes import box
 from sparsestreet.data.synthetic.sky import random_weather
 from sparsestreet.data.synthetic.textures.plain import Plain
 from sparsestreet.data.synthetic.world import build_world
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import View
 
 SETTINGS = StreetSettings(

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sparsestreet.on_its_way import OnItsWay
+from sparsestreet.host_copy import HostCopy
 from sparsestreet.ops import splat, validate
 from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
 from sparsestreet.ops.triton.launch import launch
@@ -61,7 +61,7 @@ class Case:
         self.numbers, self.dispatches = [case["pairs"], VISIBLE, 0], Dispatches()
         screen.wait_for = self.wait_for
 
-    def wait_for(self, arriving: OnItsWay) -> list[int]:
+    def wait_for(self, arriving: HostCopy) -> list[int]:
         self.dispatches.after_wait.clear()
         return self.numbers
 

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 import torch
 
-from sparsestreet.on_its_way import OnItsWay
+from sparsestreet.host_copy import HostCopy
 from sparsestreet.ops import PairLimitError, SplatSettings, splat
 from sparsestreet.ops.triton import lists, parts, pixels, screen
 from sparsestreet.ops.triton.parts import Room
@@ -100,7 +100,7 @@ def test_the_wait_comes_after_the_last_launch(monkeypatch):
     launches, seen = record_launches(monkeypatch), []
     waited = screen.wait_for
 
-    def wait_for(arriving: OnItsWay) -> list[int]:
+    def wait_for(arriving: HostCopy) -> list[int]:
         seen.append([launch.name for launch in launches])
         return waited(arriving)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence.poses import PoseNoise
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.ops import SplatSettings, splat
@@ -281,7 +281,7 @@ def test_corrections_start_on_a_smooth_path_if_rays_meet_better_there(
 ):
     """1 px of errors are 1/9 rad at a focal length of 9 px; of 0.01 rad a smooth path leaves little."""
     views, undone = driven(30, 0.01)
-    frames = Frames.of([Frame.of(view, image=torch.zeros(11, 17, 3, dtype=torch.uint8)) for view in views])
+    frames = as_frames([Frame.of(view, image=torch.zeros(11, 17, 3, dtype=torch.uint8)) for view in views])
     seen = []
 
     def found(looked_at: Frames, moving: object) -> PoseNoise | None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.scene.build import build_scene
@@ -57,7 +57,7 @@ def log_through(lens: bool = False, shutter: bool = False) -> DrivingLog:
         return replace(frame, camera=replace(camera, shutter=ROLLING.shutter if shutter else None))
 
     log = street_log()
-    return replace(log, frames=Frames.of(tuple(seen(frame) for frame in log.frames)))
+    return replace(log, frames=as_frames(tuple(seen(frame) for frame in log.frames)))
 
 
 def built(effects: dict[str, EffectSettings], log: DrivingLog) -> dict[str, Effect]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.effects import Exposure, ExposureSettings, Sky, SkySettings, linearized
 from sparsestreet.scene.graph import SceneGraph
@@ -124,7 +124,7 @@ def log_of(planted: torch.Tensor, lidar: bool = True) -> DrivingLog:
     frames = wall.frames(lambda instant, number: planted[instant, number].exp())
     sweeps = wall.sweeps() if lidar else Sweeps.of(())
     count = wall.INSTANTS
-    return DrivingLog("wall", Frames.of(frames), sweeps, (), count, 2, torch.eye(4, dtype=torch.float64))
+    return DrivingLog("wall", as_frames(frames), sweeps, (), count, 2, torch.eye(4, dtype=torch.float64))
 
 
 def tinted(size: float) -> torch.Tensor:

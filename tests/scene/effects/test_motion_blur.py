@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.geometry.transforms import inverse
+from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.effects import MotionBlur, MotionBlurSettings, plan_effects
 from sparsestreet.scene.effects.light import light_of, stored_of
 from sparsestreet.scene.effects.motion_blur import moments_of, num_moments
@@ -157,7 +157,7 @@ def exposed_log(seconds: float) -> DrivingLog:
         replace(frame, camera=replace(frame.camera, exposure=seconds), seconds=0.1 * number)
         for number, frame in enumerate(log.frames)
     ]
-    return replace(log, frames=Frames.of(tuple(frames)))
+    return replace(log, frames=as_frames(tuple(frames)))
 
 
 def test_a_log_calls_for_it_from_the_threshold_on():
@@ -175,7 +175,7 @@ def test_a_log_calls_for_it_from_the_threshold_on():
     [
         (street_log(), "no camera of hand-made declares how long it is exposed"),
         (exposed_log(0.0), "no camera of hand-made declares"),
-        (replace(exposed_log(0.01), frames=Frames.of((exposed_log(0.01).frames[0],))), "no clock and no readout tell"),
+        (replace(exposed_log(0.01), frames=as_frames((exposed_log(0.01).frames[0],))), "no clock and no readout tell"),
     ],
     ids=["silent", "zero", "one frame"],
 )

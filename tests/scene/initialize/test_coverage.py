@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.scene.initialize.coverage import VIEWS, Coverage, beyond_lidar, coverage
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.triangulation import StreetPoints
@@ -32,7 +32,7 @@ def frame(returns: list[tuple[int, int]] | None = None, sky_rows: int | None = N
 
 def data_of(*frames: Frame, points=None) -> TrainingData:
     found = None if points is None else StreetPoints(points, {})
-    return TrainingData(street_log(), Frames.of(frames), frozenset(), image_points=found)
+    return TrainingData(street_log(), as_frames(frames), frozenset(), image_points=found)
 
 
 def test_shares_by_hand():
@@ -75,7 +75,7 @@ def test_points_of_the_log_count_where_they_are_seen():
     # Windows of 9, and of 4 without the sky's 2.
     assert coverage(data) == Coverage(lidar=0.0, images=11 / 475)
     # The lidar's window of 3 x 3 overlaps that of the middle in 3 pixels.
-    returned = replace(data, frames=Frames.of([replace(view, depth=frame([(10, 10)]).depth)]))
+    returned = replace(data, frames=as_frames([replace(view, depth=frame([(10, 10)]).depth)]))
     middle = (int(cx), int(cy))
     shared = max(0, 3 - abs(middle[0] - 10)) * max(0, 3 - abs(middle[1] - 10))
     assert coverage(returned) == Coverage(lidar=9 / 475, images=(11 - shared) / 475)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.planes import fit_planes
 from sparsestreet.scene.initialize.points import Points
@@ -41,7 +41,7 @@ def data_with_lidar() -> TrainingData:
     depth = torch.zeros_like(there(frame_at(0).sky), dtype=torch.float32)
     depth[11:] = 5.0
     log = street_log()
-    log = replace(log, frames=Frames.of([replace(frame, depth=depth) for frame in log.frames]))
+    log = replace(log, frames=as_frames([replace(frame, depth=depth) for frame in log.frames]))
     return training_data(log, points=StreetPoints(ten_points(), {}))
 
 

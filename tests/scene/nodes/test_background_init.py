@@ -4,8 +4,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
-from sparsestreet.geometry.transforms import inverse, transform_points
+from sparsestreet.data.lazy import Sweeps, as_frames
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
 from sparsestreet.scene.initialize.sources import LidarPoints, NearPoints
 from sparsestreet.scene.masks import StaticMaskSettings
@@ -92,7 +92,7 @@ def street_half_covered():
     log = street_log()
     depth = torch.zeros_like(log.frames[0].sky, dtype=torch.float32)
     depth[14:] = 5.0  # and the row above is near
-    frames = Frames.of([replace(frame, depth=depth) for frame in log.frames])
+    frames = as_frames([replace(frame, depth=depth) for frame in log.frames])
     seen = [(point, view, point + 0.5, 8.5) for point in range(33) for view in range(NUM_FRAMES)]
     across = torch.stack((torch.full((33,), 20.0), torch.linspace(-9, 9, 33), torch.full((33,), 3.0)), 1)
     points = StreetPoints(triangulated(across.tolist(), seen, pixel_size=0.01), {})

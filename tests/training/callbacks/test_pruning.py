@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
 from sparsestreet.pruning import ImportanceRule, PruningRule, RenderContext
@@ -33,7 +33,7 @@ class AskedRule(PruningRule):
 
 def street_data() -> StreetData:
     """Seven instants; 1 and 4 are held out."""
-    frames = Frames.of([frame_at(index) for index in range(7)])
+    frames = as_frames([frame_at(index) for index in range(7)])
     log = DrivingLog("seven", frames, Sweeps.of(()), (), 7, 1, torch.eye(4).double())
     return StreetData(log, stride=3, offset=1)
 

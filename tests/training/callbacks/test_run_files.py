@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.ops import SplatSettings
 from sparsestreet.records.rig import RIG
@@ -42,7 +42,7 @@ def trainer(tmp_path) -> StubTrainer:
     shift, vehicle = torch.eye(4).double(), torch.eye(4).double().repeat(2, 1, 1)
     shift[0, 3], vehicle[1, 2, 3] = 0.1 + 0.2, 0.125
     path = VehiclePath(vehicle, (0, 250_000_000))
-    log = DrivingLog("seven", Frames.of(frames), Sweeps.of(()), (), 7, 1, shift, camera_names=("wide",), vehicle=path)
+    log = DrivingLog("seven", as_frames(frames), Sweeps.of(()), (), 7, 1, shift, camera_names=("wide",), vehicle=path)
     trainer.datamodule = StreetData(log, stride=3, offset=1)
     trainer.walk(3)
     return trainer

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.training.moved_views import MovedViews
 from sparsestreet.training.moved_views.returns import StreetReturns, collect
 from sparsestreet.types import Frame, Sweep, Track
@@ -42,7 +42,7 @@ def sweep(index: int) -> Sweep:
 
 @pytest.fixture(scope="module")
 def found() -> StreetReturns:
-    frames = Frames.of([frame_at(index) for index in (0, 2, 4)])
+    frames = as_frames([frame_at(index) for index in (0, 2, 4)])
     sweeps = Sweeps.of(tuple(sweep(index) for index in (0, 2, 4)))
     return collect(sweeps, frames, [CAR_TRACK, PERSON_TRACK], [CAR_TRACK], SETTINGS, seed=0)
 
@@ -85,7 +85,7 @@ def test_an_objects_hidden_returns_have_no_color():
     points = torch.tensor([CAR, HIDDEN])
     sweeps = Sweeps.of((Sweep(0, 0.0, points, torch.zeros(2, 3), torch.ones(2, dtype=torch.bool)),))
     long = track("truck", CAR, [4.0, 4.0, 8.0])
-    assert collect(sweeps, Frames.of([frame_at(0)]), [long], [long], SETTINGS, 0).objects[0].points.tolist() == [CAR]
+    assert collect(sweeps, as_frames([frame_at(0)]), [long], [long], SETTINGS, 0).objects[0].points.tolist() == [CAR]
 
 
 def test_images_of_the_nearest_instants_weigh():
@@ -94,7 +94,7 @@ def test_images_of_the_nearest_instants_weigh():
     point = Sweep(4, 1.0, torch.tensor([STREET]), torch.zeros(1, 3), torch.ones(1, dtype=torch.bool))
     for agreeing, weight in ((3, 1.0), (5, 1.0), (2, math.exp(-1000 / 255)), (7, math.exp(-1000 / 255))):
         frames = [replace(frame_at(0), frame_index=i, image=gray if i in (4, agreeing) else black) for i in range(2, 8)]
-        found = collect(Sweeps.of((point,)), Frames.of(frames), [], [], SETTINGS, 0)
+        found = collect(Sweeps.of((point,)), as_frames(frames), [], [], SETTINGS, 0)
         assert found.street.weights.tolist() == [pytest.approx(weight, rel=1e-5)]
 
 
@@ -118,7 +118,7 @@ def test_each_image_is_read_once_and_few_are_in_memory():
 
 
 def test_a_sweep_keeps_no_more_than_it_may():
-    frames, sweeps = Frames.of([frame_at(4)]), Sweeps.of((sweep(4),))
+    frames, sweeps = as_frames([frame_at(4)]), Sweeps.of((sweep(4),))
     settings = MovedViews(returns_per_sweep=2)
     kept = [collect(sweeps, frames, [], [], settings, seed).street for seed in (0, 0, 1, 2, 3)]
     assert {len(street) for street in kept} == {2}
@@ -147,7 +147,7 @@ def test_objects_are_where_they_are_when_the_image_is_taken():
     points = torch.tensor([CAR, STREET])
     sweeps = Sweeps.of((Sweep(0, 0.0, points, torch.zeros(2, 3), torch.ones(2, dtype=torch.bool)),))
     frame = replace(frame_at(0), time=0.2)
-    found = collect(sweeps, Frames.of([frame]), [car], [car], SETTINGS, seed=0)
+    found = collect(sweeps, as_frames([frame]), [car], [car], SETTINGS, seed=0)
     halfway = torch.tensor([[CAR[0] + 1.0, *CAR[1:]]])
     assert torch.equal(found.objects_at(0, 0.0).points, torch.tensor([CAR]))
     torch.testing.assert_close(found.objects_at(0, 0.2).points, halfway)

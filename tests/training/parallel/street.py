@@ -10,7 +10,7 @@ from lightning import Callback, Trainer
 from torch import Tensor
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
 from sparsestreet.scene.density import DensityStatistics, GradientDensity
@@ -53,7 +53,7 @@ class Images(Callback):
 def data() -> StreetData:
     """Seven images: no number of processes divides an epoch."""
     log = DrivingLog(
-        "seven", Frames.of([frame_at(i) for i in range(7)]), Sweeps.of(()), (), 7, 1, torch.eye(4).double()
+        "seven", as_frames([frame_at(i) for i in range(7)]), Sweeps.of(()), (), 7, 1, torch.eye(4).double()
     )
     return StreetData(log, stride=0)
 

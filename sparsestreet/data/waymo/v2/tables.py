@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.lock import Lock
+from sparsestreet.data.frame_cache import Lock
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.waymo.segment import REMEDY
 from sparsestreet.data.waymo.spool import Spool

@@ -1,5 +1,5 @@
 // Brown-Conrady distortion ("Close-range camera calibration", 1971) of normalized points and its derivatives, in the
-// form of geometry/distortion.py: past the fold of the radial polynomial it is continued in proportion to the radius.
+// form of geometry/lenses.py: past the fold of the radial polynomial it is continued in proportion to the radius.
 #pragma once
 #include "camera.hpp"
 

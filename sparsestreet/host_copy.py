@@ -6,7 +6,7 @@ import torch
 
 
 @dataclass(frozen=True)
-class OnItsWay:
+class HostCopy:
     """Numbers whose copy to the host may still be under way."""
 
     values: torch.Tensor
@@ -14,26 +14,26 @@ class OnItsWay:
     """None: they are there."""
 
     @property
-    def is_there(self) -> bool:
+    def ready(self) -> bool:
         return self.done is None or self.done.query()
 
-    def arrived(self) -> torch.Tensor:
+    def wait(self) -> torch.Tensor:
         """The numbers on the host, which waits for them if it must."""
         if self.done is not None:
             self.done.synchronize()
         return self.values
 
 
-def on_its_way(values: torch.Tensor) -> OnItsWay:
+def copy_to_host(values: torch.Tensor) -> HostCopy:
     """A copy on the host, of the values' shape, behind what their device has been told to do.
 
-    >>> on_its_way(torch.ones(2)).arrived().tolist()
+    >>> copy_to_host(torch.ones(2)).wait().tolist()
     [1.0, 1.0]
     """
     if values.device.type != "cuda":
-        return OnItsWay(values.cpu(), None)
+        return HostCopy(values.cpu(), None)
     # Memory of the host that the device can write while the host goes on.
     copy = torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
     done = torch.cuda.Event()
     done.record(torch.cuda.current_stream(values.device))
-    return OnItsWay(copy, done)
+    return HostCopy(copy, done)
