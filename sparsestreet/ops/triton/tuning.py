@@ -1,7 +1,7 @@
 """What only a device can decide: where long tiles are split, and which variant of a pixel kernel runs.
 
 Every choice draws the same image and the same gradients, up to rounding where a field says so. On an H100 the defaults
-were the fastest that was tried, or within 0.06 ms of it (docs/gpu_variants.md). No other device has been asked.
+were the fastest that was tried, or within 0.06 ms of it (docs/gpu.md). No other device has been asked.
 """
 
 from collections.abc import Iterator
