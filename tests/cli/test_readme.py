@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ def test_the_lines_of_python_train_a_street_and_render_it(tiny_street, tmp_path,
     code, streets = re.subn(r"StreetReader\(StreetSettings\(.*?\)\)", f"DriveStudioReader({root!r})", code)
     code, trainings = re.subn("max_steps=200", "max_steps=5", code)
     assert (streets, trainings) == (1, 1)
-    names = {"DriveStudioReader": DriveStudioReader}
+    names: dict[str, Any] = {"DriveStudioReader": DriveStudioReader}
     with unchecked():
         exec(code, names)
     assert names["image"].shape == (40, 64, 3)
