@@ -28,7 +28,7 @@ from typing import Any
 import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("README.md", "docs/findings.md", "docs/results.md", "docs/results/*.md")
+PAGES = ("README.md", "docs/results.md", "docs/results/*.md")
 """Whose numbers are listed where nothing binds them; other pages are listed where something does."""
 NUMBER = re.compile(r"(?<![\w.])[-+]?(?:\d{1,3}(?:,\d{3})+|\d+)(?:\.\d+)?(?=x?(?![\w])(?!\.\d))")
 """A number of a text, without sizes such as 320x192, versions and words such as 3DGS."""

@@ -297,7 +297,7 @@ class Rendering:
     radii: Float[Tensor, " n"]
     """Half the longer side of the splat's pixel box, pixels; 0 for a culled row."""
     screen_offsets: Float[Tensor, "n 2"]
-    """A leaf of zeros. After backward its .grad holds, per row, the sum over pixels of |dLoss / d mean2d|, 1/px.
+    """A leaf of zeros. After backward its .grad holds, per row, the sum over pixels of ``|dLoss / d mean2d|``, 1/px.
 
     This is the absolute gradient of AbsGS, which density control thresholds; with ``SplatSettings.plain_gradients`` it
     is the sum of dLoss / d mean2d, as in 3DGS."""

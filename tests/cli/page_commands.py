@@ -38,8 +38,6 @@ RUN_ELSEWHERE = (
     (r"trainer=ddp", "starts processes", "tests/cli/test_several_processes.py"),
     (r"train \+sweep=(?!tiny|NAME)", "takes hours; every job is composed", "tests/cli/test_sweep.py"),
     (r"hydra\.searchpath", "needs files of the reader's own", "tests/cli/test_extending.py"),
-    (r"layout=mine", "needs files of the reader's own", "tests/cli/test_convert.py"),
-    (r"experiment=\{streetgs,", "has an old name, as the page says", "tests/cli/test_compose.py"),
 )
 
 STAND_INS = {
@@ -48,7 +46,6 @@ STAND_INS = {
     "+sweep=NAME": "+sweep=tiny",
     "sweep=outputs/sweeps/NAME": "sweep=outputs/sweeps/tiny",
     "seed=N": "seed=0",
-    "seed={0,1,2}": "seed=0",
     "seed=0,1,2": "seed=0",
     "budget.minutes=N": "budget.minutes=1",
     "FILE": "file.mp4",

@@ -68,7 +68,7 @@ def place(finished, tiny_street, tmp_path_factory) -> Path:
     shutil.copytree(finished, folder / "RUN")
     assert train([*tiny_street, *TINY_RIGID, "schedule.max_steps=2", f"out={folder / 'outputs' / 'plain'}"]) == 0
     assert export([str(folder / "RUN"), str(folder / "street.street")]) == 0
-    for name in ("RUN", "A", "B", "demo/none"):
+    for name in ("RUN", "A", "B", "demo/none", "demo/removal"):
         shutil.copytree(folder / "RUN", folder / "outputs" / name)
     (edits,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "docs" / "edit_and_drive.md").read_text(), flags=re.S)
     names = list(objects_of(load_scene(folder / "RUN").scene))

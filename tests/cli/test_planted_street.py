@@ -2,7 +2,7 @@
 
 Pruning by removal finds them and spares what is visible. The paper's stages do not do both at once: gentle masks spare
 what is visible and leave half of the planted; the importance gate takes rows that would be missed
-(docs/results/ideal_lidar.md).
+(docs/results/older.md).
 """
 
 from dataclasses import replace
