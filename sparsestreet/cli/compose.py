@@ -19,8 +19,8 @@ from yaml import YAMLError
 
 import sparsestreet.cli.resolvers  # noqa: F401 - conf/ asks for them
 from sparsestreet.cli.limits import limit_problem
+from sparsestreet.files import read_yaml
 from sparsestreet.naming import nearest
-from sparsestreet.safe_yaml import read_yaml
 
 PACKAGE = Path(__file__).resolve().parents[1]
 # An installed wheel carries conf/ inside the package; a checkout has it beside the package.

@@ -8,13 +8,13 @@ import yaml
 from rich.console import Console
 
 from sparsestreet.cli.options import run_command
+from sparsestreet.files import read_yaml
 from sparsestreet.metrics.protocols import PROTOCOLS, Protocol
 from sparsestreet.report import collect, figure, markdown, sections, tables
 from sparsestreet.report.arms import arms
 from sparsestreet.report.collect import keep_records
 from sparsestreet.report.figures_readme import time_figure
 from sparsestreet.report.sweep import sweep_records, write_report
-from sparsestreet.safe_yaml import read_yaml
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]

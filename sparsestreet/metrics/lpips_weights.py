@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from sparsestreet.metrics.lpips import ALEX, VGG16, Lpips, LpipsWeights, Stage
-from sparsestreet.safe_pickle import read_pickled
+from sparsestreet.pickles import read_pickled
 
 FOLDER_VARIABLE = "SPARSESTREET_LPIPS"
 """Environment variable that names a folder with the files, for when the package is not installed."""

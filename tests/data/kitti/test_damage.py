@@ -10,7 +10,6 @@ from sparsestreet.data.kitti.tracklets import read_tracklets
 from sparsestreet.data.kitti.velodyne import read_points
 from sparsestreet.data.problems import LogError
 from tests.data.damage import (
-    FETCHED,
     LAUGHS,
     assert_found,
     bomb,
@@ -71,8 +70,7 @@ DAMAGES = {
     "no starts": (START, gone, "missing"),
     "no XML": (XML, written(b"objects: 3"), "no XML"),
     "torn XML": (XML, cut, "no XML"),
-    "entities": (XML, replaced("<!DOCTYPE boost_serialization>", LAUGHS), "declares entities"),
-    "files that are fetched": (XML, replaced("<!DOCTYPE boost_serialization>", FETCHED), "refers to another file"),
+    "entities": (XML, replaced("<!DOCTYPE boost_serialization>", LAUGHS), "EntitiesForbidden"),
     "endless XML": (XML, long(1 << 40), "more than the"),
     "deep XML": (XML, written(b"<a>" * 100_000), "more than 64 deep"),
     "an encoding of nobody": (XML, replaced("UTF-8", "klingon"), "no XML"),

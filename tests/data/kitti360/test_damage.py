@@ -10,7 +10,6 @@ from sparsestreet.data.kitti360 import Kitti360Reader
 from sparsestreet.data.kitti360.boxes import read_boxes
 from sparsestreet.data.problems import LogError
 from tests.data.damage import (
-    FETCHED,
     LAUGHS,
     assert_found,
     bomb,
@@ -78,8 +77,7 @@ DAMAGES = {
     "labels of colors": (LABELS, png(32, 24, "RGB"), "has the mode RGB"),
     "no XML": (XML, written(b"{}"), "no XML"),
     "torn XML": (XML, cut, "no XML"),
-    "entities": (XML, replaced(HEAD, HEAD + LAUGHS), "declares entities"),
-    "files that are fetched": (XML, replaced(HEAD, HEAD + FETCHED), "refers to another file"),
+    "entities": (XML, replaced(HEAD, HEAD + LAUGHS), "EntitiesForbidden"),
     "endless XML": (XML, long(1 << 40), "more than the"),
     "no instance": (XML, replaced("<instanceId>7</instanceId>", ""), "no number"),
     "half a class": (XML, replaced("<semanticId>13", "<semanticId>13.5"), "no integers"),

@@ -16,7 +16,7 @@ from sparsestreet.data.waymo.log_segment import LogSegment
 from sparsestreet.data.waymo.pixels import DIVISOR
 from sparsestreet.data.waymo.segment import CAMERAS, BoxLabel
 from sparsestreet.data.waymo.v1 import messages as fields
-from sparsestreet.data.waymo.v1.crc32c import masked_crc32c
+from sparsestreet.data.waymo.v1.records import masked_crc32c
 from sparsestreet.data.waymo.writer import WaymoWriter
 from sparsestreet.data.writer import LogFile
 from sparsestreet.types import View
