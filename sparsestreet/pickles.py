@@ -84,13 +84,13 @@ class _Type:
 
     names = r"[?]|b1|[iu][1248]|f[248]"
 
-    def __init__(self, name: str, align: bool = False, copy: bool = False) -> None:
+    def __init__(self, name: Any, *_: Any) -> None:
         if not isinstance(name, str) or not re.fullmatch(self.names, name):
             shown = name if isinstance(name, str) else type(name).__name__
             raise ValueError(f"it holds an array of {shown[:40]!r}, not of numbers")
         self.value = np.dtype(name)
 
-    def __setstate__(self, state: tuple[Any, ...]) -> None:
+    def __setstate__(self, state: Any) -> None:
         """Take the order of bytes alone: fields would turn numbers into objects."""
         self.value = self.value.newbyteorder("=" if state[1] == "|" else state[1])
 
@@ -104,7 +104,7 @@ class _ObjectType(_Type):
 class _Array(np.ndarray):
     """An array whose type was checked."""
 
-    def __setstate__(self, state: tuple[Any, ...]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def __setstate__(self, state: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         version, shape, kind, fortran, data = state
         super().__setstate__((version, shape, _numpy_type(kind), fortran, data))
 
@@ -114,7 +114,7 @@ class _Joblib:
 
     file: BinaryIO
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Any) -> None:
         if state.get("numpy_array_alignment_bytes") is not None:
             self.file.read(self.file.read(1)[0])
         kind = _numpy_type(state["dtype"])
@@ -125,7 +125,7 @@ class _Joblib:
 class _Attributes:
     """An object that only keeps its attributes."""
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Any) -> None:
         # Without this method a pickle could set attributes of the class itself.
         vars(self).update(state)
 
@@ -178,11 +178,11 @@ def _numpy_type(kind: Any) -> np.dtype:
     return kind.value
 
 
-def _new_array(kind: type, shape: Any, typecode: Any) -> np.ndarray:
+def _new_array(*_: Any) -> np.ndarray:
     return _Array(0, np.uint8)
 
 
-def _from_buffer(data: Any, kind: Any, shape: Any, order: str) -> np.ndarray:
+def _from_buffer(data: Any, kind: Any, shape: Any, order: Any) -> np.ndarray:
     """Return a writable copy; NumPy refuses objects."""
     return np.frombuffer(bytearray(data), _numpy_type(kind)).reshape(shape, order=order)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
@@ -192,17 +192,17 @@ def _scalar(kind: Any, data: Any) -> Any:
     return np.frombuffer(data, _numpy_type(kind))[0]
 
 
-def _encoded(text: str, encoding: str) -> bytes:
+def _encoded(text: Any, encoding: Any) -> bytes:
     if encoding != "latin1":
         raise ValueError(f"it holds bytes in the encoding {encoding!r}")
     return text.encode("latin1")
 
 
-def _storage(data: bytes) -> Any:
+def _storage(data: Any) -> Any:
     return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
 
 
-def _tensor(storage: Any, offset: int, size: Any, stride: Any, *_: Any) -> np.ndarray:
+def _tensor(storage: Any, offset: Any, size: Any, stride: Any, *_: Any) -> np.ndarray:
     if not isinstance(storage, torch.storage.TypedStorage):
         raise ValueError("it holds a tensor without numbers")
     flat = torch.empty(0, dtype=storage.dtype).set_(storage._untyped_storage)

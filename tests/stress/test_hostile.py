@@ -273,7 +273,7 @@ OF_A_RUN = {
         ("train", "resume={run}"), "checkpoints/last.ckpt", packed_checkpoint, "is no checkpoint of a training"
     ),
     "a description of brackets": (("evaluate", "{run}"), "run.json", DEEP, "brackets in brackets without end"),
-    "a picture of 10^12 pixels": (("render", "{run}", "{run}.mp4"), "views.json", huge_views, "536870912 pixels"),
+    "a picture of 10^12 pixels": (("render", "{run}", "{run}.mp4"), "views.json", huge_views, "16,384 pixels a side"),
 }  # fmt: skip
 
 

@@ -51,7 +51,7 @@ def _content(path: Path) -> bytes:
 def _names() -> dict[str, Any]:
     """Return what a table of pandas 0.25 (which wrote the data set) to 3 may name."""
     import pandas
-    from pandas._libs.internals import _unpickle_block
+    import pandas._libs.internals as internals
     from pandas.core.internals import BlockManager
 
     class Manager(BlockManager):
@@ -62,7 +62,7 @@ def _names() -> dict[str, Any]:
             inner = state[3]["0.14.1"]
             check(inner["axes"], pandas.Index)
             check([block["values"] for block in inner["blocks"]], np.ndarray)
-            super().__setstate__(state)
+            super().__setstate__(state)  # pyright: ignore[reportAttributeAccessIssue]
 
     def check(parts: Any, kind: type) -> None:
         """Refuse lists, which pandas would walk through however often they name each other."""
@@ -71,7 +71,7 @@ def _names() -> dict[str, Any]:
 
     def block(values: Any, *place: Any) -> Any:
         check([values], np.ndarray)
-        return _unpickle_block(values, *place)
+        return internals._unpickle_block(values, *place)  # pyright: ignore[reportAttributeAccessIssue]
 
     def index(kind: str, state: Mapping[str, Any]) -> Any:
         if kind == _RANGE:

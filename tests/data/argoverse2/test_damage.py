@@ -14,6 +14,7 @@ from PIL import Image
 from sparsestreet.data.argoverse2 import Argoverse2Reader, feather
 from sparsestreet.data.argoverse2.feather import read_columns
 from sparsestreet.data.problems import LogError
+from tests.data.damage import daily
 from tests.data.plan import Plan
 
 pytest.importorskip("pyarrow", reason="feather files need pyarrow")
@@ -186,7 +187,9 @@ DAMAGES: dict[str, tuple[Callable[[Path], None], str, str]] = {
 }
 
 
-@pytest.mark.parametrize("name", DAMAGES)
+@pytest.mark.parametrize(
+    "name", daily(DAMAGES, "half", "text for numbers", "poses backwards", "a pose of NaN", "a box twice")
+)
 def test_a_damage_is_one_error_that_names_the_file(name, log):
     damage, file, said = DAMAGES[name]
     damage(log)
