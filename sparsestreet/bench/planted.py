@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from sparsestreet.bench.records import RecordFile
-from sparsestreet.records.effects import EffectDecision
+from sparsestreet.records.run import EffectDecision
 
 LEVELS = (0.5, 2.0)
 """Times the dial at which an effect is meant to be called for: below the one it must be off, above the other on."""

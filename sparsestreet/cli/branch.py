@@ -18,8 +18,8 @@ from omegaconf import DictConfig
 from sparsestreet.cli.compose import load_run_config, resolved
 from sparsestreet.cli.folder import configuration_of, identity_of_run, is_whole, lies_in
 from sparsestreet.cli.resume import run_of
-from sparsestreet.records.branch_of import BRANCH_OF, BranchOf, moment_of
 from sparsestreet.records.configuration import IDENTITY_KEYS, Configuration, flat_config, without
+from sparsestreet.records.run import BRANCH_OF, BranchOf, moment_of
 
 log = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from sparsestreet.cli.auto import with_found_data
 from sparsestreet.cli.checks import config_problem
 from sparsestreet.cli.compose import as_typed, composed, override_problem, value_of
 from sparsestreet.cli.effect_words import with_effect_keys
-from sparsestreet.records.effects import EffectDecision
+from sparsestreet.records.run import EffectDecision
 
 if TYPE_CHECKING:
     from sparsestreet.scene.effects import EffectSettings

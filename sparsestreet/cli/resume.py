@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sparsestreet.cli.compose import configuration, load_run_config, quoted, value_of, without_flags
 from sparsestreet.cli.targets import check_modules, check_places, check_received, leaves
-from sparsestreet.records.branch_of import moment_of
+from sparsestreet.records.run import moment_of
 from sparsestreet.safe_yaml import read_yaml
 
 _PASSING = {"overrides", "runtime", "sweeper", "sweep"}

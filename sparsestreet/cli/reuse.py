@@ -19,8 +19,7 @@ from sparsestreet.cli.resume import has_checkpoint
 from sparsestreet.cli.targets import targets_of
 from sparsestreet.records.configuration import Configuration, flat_config, only
 from sparsestreet.records.costs import COSTS, update_costs
-from sparsestreet.records.run import RUN, RunDescription
-from sparsestreet.records.same_as import SAME_AS, SameAs
+from sparsestreet.records.run import RUN, SAME_AS, RunDescription, SameAs
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
 

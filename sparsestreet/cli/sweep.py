@@ -24,7 +24,7 @@ from sparsestreet.cli.locks import FolderTakenError
 from sparsestreet.cli.resolvers import UNCOUNTED
 from sparsestreet.cli.signals import beside_each_other, end_with_jobs
 from sparsestreet.records.configuration import flat_config
-from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
+from sparsestreet.records.run import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
 

@@ -8,7 +8,7 @@ from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.costs import EffectGain
-from sparsestreet.records.quality import FrameQuality, summarize
+from sparsestreet.records.summary import FrameQuality, summarize
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 

@@ -16,7 +16,7 @@ from sparsestreet.metrics import ssim
 from sparsestreet.metrics.definitions import GAUSS_WINDOW, LPIPS_SIDES, quantities_of
 from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
 from sparsestreet.ranks import ALONE, Ranks
-from sparsestreet.records.quality import FrameQuality, RegionQuality
+from sparsestreet.records.summary import FrameQuality, RegionQuality
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import Frame, View

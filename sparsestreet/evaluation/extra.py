@@ -14,8 +14,7 @@ from sparsestreet.metrics.extractors import LastLayer
 from sparsestreet.metrics.lpips_weights import open_lpips
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import stage
-from sparsestreet.records.novel import NOVEL, NovelRecord
-from sparsestreet.records.presets import PRESETS, PresetRecord
+from sparsestreet.records.renders import NOVEL, PRESETS, NovelRecord, PresetRecord
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 

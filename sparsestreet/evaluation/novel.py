@@ -21,7 +21,7 @@ from sparsestreet.metrics.distances import frechet_distance, frechet_name, kerne
 from sparsestreet.metrics.extractors import Extractor
 from sparsestreet.metrics.image import masked_psnr, psnr
 from sparsestreet.metrics.lpips import Lpips
-from sparsestreet.records.novel import NovelRecord, NovelShift
+from sparsestreet.records.renders import NovelRecord, NovelShift
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Frame, View

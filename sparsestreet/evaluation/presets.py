@@ -16,8 +16,8 @@ from sparsestreet.metrics.image import psnr
 from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import clock_of
-from sparsestreet.records.presets import PresetRecord, RenderedAs
-from sparsestreet.records.quality import FrameQuality, summarize
+from sparsestreet.records.renders import PresetRecord, RenderedAs
+from sparsestreet.records.summary import FrameQuality, summarize
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View

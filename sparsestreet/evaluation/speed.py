@@ -14,8 +14,8 @@ from torch import Tensor
 from sparsestreet.evaluation.scene_parts import has_masks, without_closed_rows
 from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import splat
-from sparsestreet.records.latency import FRAME, RASTER, RIG, Latency, Percentiles
 from sparsestreet.records.provenance import processor_name
+from sparsestreet.records.summary import FRAME, RASTER, RIG, Latency, Percentiles
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import View

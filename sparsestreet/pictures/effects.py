@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.records.costs import COSTS, CostRecord
-from sparsestreet.records.effects import EffectDecision
-from sparsestreet.records.run import RUN
+from sparsestreet.records.run import RUN, EffectDecision
 
 _ON, _OFF, _PREDICTED = "#3465a4", "#c8c8c8", "#555555"
 _GAINS = (("full", "full image", "#3465a4"), ("vehicle", "vehicles", "#e07b00"), ("human", "people", "#4e9a06"))

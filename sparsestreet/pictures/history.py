@@ -6,9 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sparsestreet.pictures.plots import plot_counts, plot_psnr
-from sparsestreet.records.held_out import HELD_OUT_CURVE
-from sparsestreet.records.ledger import LEDGER, MASK, PRUNING, CountChange
-from sparsestreet.records.logged import LOGGED
+from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, LOGGED, MASK, PRUNING, CountChange
 from sparsestreet.records.run import RUN
 
 MARKED = (MASK, PRUNING)

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.records.same_as import SAME_AS
+from sparsestreet.records.run import SAME_AS
 from sparsestreet.records.strict_json import json_line, write_atomically
 from sparsestreet.records.summary import SUMMARY, RunSummary
 

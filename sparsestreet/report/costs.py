@@ -1,12 +1,15 @@
-"""The cost of each arm in absolute numbers (``records/summary.json`` and ``records/cost.json``)."""
+"""What each variant costs: size, time and memory, its effects, and the seconds to a quality."""
 
 import statistics
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-from sparsestreet.records.costs import COSTS, PRUNE, CostRecord
-from sparsestreet.report.arms import Arm, busy_arms
+from sparsestreet.records.costs import COSTS, PRUNE, CostRecord, EffectGain
+from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.run import EffectDecision
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.grid import Cell, Grid, number_cell
+from sparsestreet.report.tables import ABSENT, BUSY, Cell, Grid, number_cell
+from sparsestreet.report.variants import Unit, Variant, busy_variants, plain_of
 
 _CLOCK_OF = {"ms/frame": "frames", "train s": "training"} | dict.fromkeys(("seconds", "ms of a step"), "training")
 """Heading, or shared heading, of a column of times -> what its machine was measured with."""
@@ -26,7 +29,7 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] 
 )
 
 
-def what_arms_cost(arms: Sequence[Arm]) -> Grid:
+def what_variants_cost(arms: Sequence[Variant]) -> Grid:
     """Returns size, speed, time and memory of every arm, as means over its runs."""
     shown = [column for column in _COLUMNS if any(_mean(arm, column[3]) is not None for arm in arms)]
     rows = []
@@ -44,7 +47,7 @@ def what_arms_cost(arms: Sequence[Arm]) -> Grid:
         "means over the runs of an arm; train s: steps and pruning, without evaluation; whole command: from the import "
         "of torch to the pictures; a step: medians over the steps that records/phases.csv notes"
     ]
-    return Grid("costs", "What each arm costs", header, tuple(rows), (*notes, *busy_arms(arms)))
+    return Grid("costs", "What each arm costs", header, tuple(rows), (*notes, *busy_variants(arms)))
 
 
 def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float | None:
@@ -62,6 +65,170 @@ def _step(costs: CostRecord, *parts: str) -> float | None:
     return sum(found) if found else None
 
 
-def _mean(arm: Arm, value: Callable[[RunRecord], float | None]) -> float | None:
+def _mean(arm: Variant, value: Callable[[RunRecord], float | None]) -> float | None:
     found = [number for record in arm.records if (number := value(record)) is not None]
     return statistics.fmean(found) if found else None
+
+
+_HEADER = (
+    *(("", name) for name in ("arm", "effect", "state", "decided by", "value", "threshold")),
+    *(("ms of a frame", name) for name in ("predicted", "measured")),
+    ("", "MB"),
+    *(("dB", name) for name in ("predicted", "full", "vehicles", "people")),
+)
+
+
+def what_effects_cost(arms: Sequence[Variant]) -> Grid:
+    """Returns a row for each effect of each arm's plan; numbers are means over the arm's runs."""
+    rows = [row for arm in arms for row in _rows(arm)]
+    notes = [
+        "measured: frames and PSNR of the finished scene with the effect, less those without it; a scene that was "
+        "trained without the effect would have made up for a part"
+    ]
+    if busy := [arm.name for arm in arms if _busy([COSTS.find(record.folder) for record in arm.records])]:
+        notes.append(f"{BUSY} times of a machine that was not quiet, compared with no other: {', '.join(busy)}")
+    return Grid("effects", "What each effect costs and brings", _HEADER, tuple(rows), tuple(notes))
+
+
+def effects_alike(arms: Sequence[Variant]) -> str | None:
+    """Returns which effects are on, in a sentence, if they are the same in all arms; None if arms differ in them."""
+    plans = {tuple((one.name, one.on) for one in record.summary.run.effects) for arm in arms for record in arm.records}
+    if len(plans) != 1:
+        return None
+    on = [name for name, is_on in next(iter(plans)) if is_on]
+    return f"all arms have the same effects ({', '.join(on) or 'none'})"
+
+
+def _rows(arm: Variant) -> list[tuple[Cell, ...]]:
+    plans = [{one.name: one for one in record.summary.run.effects} for record in arm.records]
+    costs = [COSTS.find(record.folder) for record in arm.records]
+    runs = tuple(record.folder.name for record in arm.records)
+    names = list(dict.fromkeys(name for plan in plans for name in plan))
+    return [
+        tuple(Cell(text, runs=runs) for text in (arm.title, *_cells(name, [plan[name] for plan in plans], costs)))
+        for name in names
+        if all(name in plan for plan in plans)
+    ]
+
+
+def _cells(name: str, found: Sequence[EffectDecision], costs: Sequence[CostRecord | None]) -> list[str]:
+    first, on = found[0], sum(one.on for one in found)
+    measured = [None if cost is None else cost.effects.get(name) for cost in costs]
+    gains = [None if cost is None else cost.gains.get(name) for cost in costs]
+    state = ("on" if on else "off") if on in (0, len(found)) else f"on in {on} of {len(found)}"
+    value = _mean_effects([one.value for one in found])
+    return [
+        name,
+        state,
+        ", ".join(dict.fromkeys(one.source for one in found)),
+        ABSENT if value is None else f"{value:.3g} {first.unit}",
+        ABSENT if first.threshold is None else f"{first.threshold:g}",
+        _text([one.ms for one in found], "{:.2f}"),
+        f"{_text(measured, '{:.2f}')} {BUSY if _busy(costs) and any(measured) else ''}".rstrip(),
+        _text([4e-6 * one.numbers for one in found], "{:.3g}"),
+        _text([one.gain for one in found], "{:+.2f}"),
+        *(_gain(gains, of) for of in (lambda gain: gain.full, lambda gain: gain.vehicle, lambda gain: gain.human)),
+    ]
+
+
+def _busy(costs: Sequence[CostRecord | None]) -> bool:
+    """Returns whether a machine was not quiet while frames were timed with and without each effect."""
+    return any(cost is not None and cost.noise is not None and not cost.noise.quiet for cost in costs)
+
+
+def _gain(gains: Sequence[EffectGain | None], of: Callable[[EffectGain], float | None]) -> str:
+    return _text([None if gain is None else of(gain) for gain in gains], "{:+.2f}")
+
+
+def _text(values: Sequence[float | None], form: str) -> str:
+    mean = _mean_effects(values)
+    return ABSENT if mean is None else form.format(mean)
+
+
+def _mean_effects(values: Sequence[float | None]) -> float | None:
+    given = [value for value in values if value is not None]
+    return statistics.fmean(given) if given else None
+
+
+BELOW = (1.0, 0.5, 0.1)
+"""Qualities whose time is reported, dB below the last quality of the plain run."""
+
+
+@dataclass(frozen=True)
+class QualityCurve:
+    """The probe of held-out views of one run, or the mean of several runs."""
+
+    seconds: tuple[float, ...]
+    """Seconds of training without evaluation."""
+    psnr: tuple[float, ...]
+    """Full image, dB."""
+
+
+def curves_of_runs(arm: Variant) -> dict[Unit, list[QualityCurve]]:
+    """Returns scene and seed -> the curves of its runs, for the runs that hold views out and have a curve."""
+    found = {unit: [_curve(HELD_OUT_CURVE.find(run.folder) or ()) for run in runs] for unit, runs in arm.runs().items()}
+    known = {unit: [curve for curve in curves if curve.seconds] for unit, curves in found.items()}
+    return {unit: curves for unit, curves in known.items() if curves}
+
+
+def curves_of(arm: Variant) -> dict[Unit, QualityCurve]:
+    """Returns scene and seed -> the curve of its run, or the mean of several runs."""
+    return {unit: mean_curve(curves) for unit, curves in curves_of_runs(arm).items()}
+
+
+def mean_curve(curves: Sequence[QualityCurve]) -> QualityCurve:
+    """Returns mean seconds and mean dB at each look that all curves have.
+
+    >>> mean_curve([QualityCurve((10.0, 20.0), (22.0, 25.0)), QualityCurve((14.0,), (24.0,))])
+    QualityCurve(seconds=(12.0,), psnr=(23.0,))
+    """
+    looks = range(min(len(curve.seconds) for curve in curves))
+    seconds = tuple(statistics.fmean(curve.seconds[look] for curve in curves) for look in looks)
+    return QualityCurve(seconds, tuple(statistics.fmean(curve.psnr[look] for curve in curves) for look in looks))
+
+
+def _curve(looks: Sequence[HeldOutLook]) -> QualityCurve:
+    points = [(look.seconds, look.psnr_full) for look in looks if look.psnr_full is not None]
+    return QualityCurve(tuple(at for at, _ in points), tuple(psnr for _, psnr in points))
+
+
+def seconds_to(curve: QualityCurve, psnr: float) -> float | None:
+    """Returns the training seconds at the first look with at least this PSNR, or None; looks are not interpolated.
+
+    >>> seconds_to(QualityCurve(seconds=(10.0, 20.0), psnr=(22.0, 25.0)), 24.0)
+    20.0
+    """
+    return next((at for at, value in zip(curve.seconds, curve.psnr, strict=True) if value >= psnr), None)
+
+
+def time_to_quality(arms: Sequence[Variant]) -> Grid | None:
+    """Returns median seconds to the plain run's last PSNR minus 1, 0.5 and 0.1 dB; None if no run has a curve."""
+    curves = {arm.name: curves_of(arm) for arm in arms}
+    if not any(curves.values()):
+        return None
+    rows = []
+    for arm in arms:
+        plain = plain_of(arm, arms)
+        if plain is None or not curves[arm.name]:
+            continue
+        runs = tuple(record.folder.name for record in arm.records)
+        times = [_reached(curves[arm.name], curves[plain.name], below) for below in BELOW]
+        cells = [Cell(f"{time} {arm.busy('training') if ' s' in time else ''}".rstrip(), runs=runs) for time in times]
+        rows.append((Cell(arm.title, runs=runs), *cells))
+    header = (("", "arm"), *(("", f"base - {below:g} dB") for below in BELOW))
+    notes = (
+        "training seconds, evaluation left out, to the first look at held-out views that is as good: the median of the "
+        "runs that get there; base: the last look of the plain run of the same scene and seed",
+        "a look is a fixed probe of held-out views; nothing is interpolated between two looks",
+    )
+    return Grid("time_to_quality", "Time to quality", header, tuple(rows), (*notes, *busy_variants(arms)))
+
+
+def _reached(ours: dict[Unit, QualityCurve], plain: dict[Unit, QualityCurve], below: float) -> str:
+    shared = ours.keys() & plain.keys()
+    times = [seconds_to(ours[unit], plain[unit].psnr[-1] - below) for unit in shared]
+    reached = [time for time in times if time is not None]
+    if not reached:
+        return "not reached" if shared else "-"
+    text = f"{statistics.median(reached):.1f} s"
+    return text if len(reached) == len(times) else f"{text} ({len(reached)} of {len(times)})"

@@ -1,8 +1,9 @@
-"""Figures of a sweep: their style, and quality against each cost (matplotlib without a display)."""
+"""Figures of a sweep (matplotlib without a display): quality against costs, curves over time, a frame's parts."""
 
 import io
 import re
 import statistics
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,15 +14,19 @@ from typing import Any, TypeVar
 import matplotlib
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.records.quality import HELD_OUT
-from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
+from sparsestreet.pictures.history import count_curves, marks
+from sparsestreet.records.costs import COSTS
+from sparsestreet.records.curves import LEDGER
+from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.report.costs import curves_of, curves_of_runs, mean_curve
+from sparsestreet.report.variants import Unit, Value, Variant, by_scene, plain_of
 
 T = TypeVar("T")
 
@@ -125,7 +130,7 @@ class Style:
     dashes: str
 
 
-def styles(arms: Sequence[Arm]) -> dict[str, Style]:
+def styles(arms: Sequence[Variant]) -> dict[str, Style]:
     """Returns name of an arm -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
     methods, kinds = list(dict.fromkeys(arm.plain_label for arm in arms)), _kinds(arms)
     every = list(dict.fromkeys(kinds.values()))
@@ -145,7 +150,7 @@ def styles(arms: Sequence[Arm]) -> dict[str, Style]:
     return found
 
 
-def _kinds(arms: Sequence[Arm]) -> dict[str, str]:
+def _kinds(arms: Sequence[Variant]) -> dict[str, str]:
     """Returns name of an arm -> its sparsification, or all that its name says beside its method."""
     of_method = Counter((arm.plain_label, arm.sparsify) for arm in arms)
     several = {sparsify for (_, sparsify), number in of_method.items() if number > 1}
@@ -168,7 +173,7 @@ def _in_turn(kinds: Sequence[str], known: Mapping[str, T], spare: Sequence[T]) -
     return found | {kind: left[index % len(left)] for index, kind in enumerate(others)}
 
 
-def _in_legend(arm: Arm, kind: str) -> str:
+def _in_legend(arm: Variant, kind: str) -> str:
     if arm.control:
         return f"control: {kind}"
     return "plain" if kind == "none" else f"plain {kind}" if arm.sparsify == "none" else kind
@@ -197,7 +202,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return best
 
 
-def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
+def pareto(arms: Sequence[Variant], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
     """Draws quality of the full image, people and vehicles against one cost. Returns whether there was any to draw.
 
     Every run is a small mark, every arm's mean a large one, with an arrow from plain to pruned. The front is that of
@@ -225,7 +230,7 @@ def _held_out(metric: str) -> Value:
     return lambda run: run.mean(metric, HELD_OUT)
 
 
-def _pareto_panel(axes: Axes, arms: Sequence[Arm], of: tuple[str, str, Value], quality: Value, region: str) -> Says:
+def _pareto_panel(axes: Axes, arms: Sequence[Variant], of: tuple[str, str, Value], quality: Value, region: str) -> Says:
     style = styles(arms)
     cost, unit = of[2], of[1]
     means: dict[str, tuple[float, float]] = {}
@@ -261,7 +266,7 @@ def _pareto_panel(axes: Axes, arms: Sequence[Arm], of: tuple[str, str, Value], q
     return says
 
 
-def _paint(style: Mapping[str, Style], arm: Arm) -> str:
+def _paint(style: Mapping[str, Style], arm: Variant) -> str:
     """Returns the color of the method, or of the kind if there is one method."""
     own = style[arm.name]
     return own.color if len({one.method for one in style.values()} - {GREY}) <= 1 else own.method
@@ -282,7 +287,7 @@ def _in_words(point: tuple[float, float], unit: str) -> str:
 
 
 def paired_means(
-    arm: Arm, plain: Arm | None, cost: Value, quality: Value
+    arm: Variant, plain: Variant | None, cost: Value, quality: Value
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Returns where an arrow starts and ends: the means of the plain arm and of an arm over the units of both.
 
@@ -298,7 +303,7 @@ def paired_means(
     return start, end
 
 
-def _points(arm: Arm, cost: Value, quality: Value) -> dict[Unit, tuple[float, float]]:
+def _points(arm: Variant, cost: Value, quality: Value) -> dict[Unit, tuple[float, float]]:
     """Returns scene and seed -> cost and quality, where both are known."""
     costs, qualities = arm.units(cost), arm.units(quality)
     return {unit: (costs[unit], qualities[unit]) for unit in sorted(costs.keys() & qualities.keys())}
@@ -311,7 +316,7 @@ def _mean_point(points: Mapping[Unit, tuple[float, float]]) -> tuple[float, floa
     return x, y
 
 
-def _legend(arms: Sequence[Arm]) -> list[Line2D]:
+def _legend(arms: Sequence[Variant]) -> list[Line2D]:
     style = styles(arms)
     methods = {arm.plain_label: style[arm.name].method for arm in arms if not arm.control}
     dots = [Line2D([], [], color=paint, marker="o", linestyle="", label=name) for name, paint in methods.items()]
@@ -331,3 +336,197 @@ def _legend(arms: Sequence[Arm]) -> list[Line2D]:
         for kind, arm in kinds.items()
     ]
     return [*dots, *shapes, Line2D([], [], color=_INK, linestyle="--", linewidth=0.9, label="front of the means")]
+
+
+_MOST_BESIDE_CURVES = 6
+"""Largest number of names in a legend that stands within a panel."""
+
+
+def held_out_over_time(arms: Sequence[Variant], path: Path) -> bool:
+    """Draws held-out PSNR over training seconds, a panel a method, a line a run. Returns whether a run has a curve."""
+    found = {arm.name: [curve for some in curves_of_runs(arm).values() for curve in some] for arm in arms}
+    drawn = [arm for arm in arms if found[arm.name]]
+    if not drawn:
+        return False
+    methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
+    figure, axes = panels(len(methods))
+    says: Says = {}
+    look = styles(arms)
+    for one, method in zip(axes, methods, strict=True):
+        for arm in _of(drawn, method):
+            for curve in found[arm.name]:
+                name = f"curve {len(says)}"
+                one.plot(curve.seconds, curve.psnr, **_line(look[arm.name]), marker=".", markersize=3, gid=name)
+                looks = zip(curve.seconds, curve.psnr, strict=True)
+                says[name] = [f"{arm.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
+        _finish(one, method, "training seconds")
+    axes[0].set_ylabel("held-out PSNR, dB")
+    _legends(figure, axes)
+    write_svg(figure, path, says)
+    return True
+
+
+def counts_over_time(arms: Sequence[Variant], path: Path) -> bool:
+    """Draws the number of Gaussians over steps, a panel a method, a line a run; dots mark masks and pruning passes."""
+    drawn = [arm for arm in arms if any(LEDGER.exists(record.folder) for record in arm.records)]
+    if not drawn:
+        return False
+    methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
+    figure, axes = panels(len(methods))
+    look = styles(arms)
+    for one, method in zip(axes, methods, strict=True):
+        for arm in _of(drawn, method):
+            for record in arm.records:
+                if LEDGER.exists(record.folder):
+                    _counts(one, look[arm.name], record.folder)
+        one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+        _finish(one, method, "step")
+    axes[0].set_ylabel("Gaussians")
+    _legends(figure, axes)
+    write_svg(figure, path)
+    return True
+
+
+def _counts(axes: Axes, look: Style, folder: Path) -> None:
+    changes = LEDGER.read(folder)
+    steps, nodes = count_curves(changes)
+    total = [sum(values) for values in zip(*nodes.values(), strict=True)]
+    axes.plot(steps, total, drawstyle="steps-post", **_line(look))
+    at = dict(zip(steps, total, strict=True))
+    taken = sorted({step for step, _ in marks(changes)})
+    axes.plot(taken, [at[step] for step in taken], ".", markersize=4, color=look.color, label="_")
+
+
+def frame_waterfall(arms: Sequence[Variant], path: Path) -> bool:
+    """Draws the additional time of a frame with each node and effect, a bar an arm. Returns whether a run has it."""
+    costs = {arm.name: _frame_costs(arm) for arm in arms}
+    drawn = [arm for arm in arms if costs[arm.name]]
+    if not drawn:
+        return False
+    parts = list(dict.fromkeys(part for arm in drawn for part in costs[arm.name]))
+    titles = [textwrap.wrap(arm.title, 40) for arm in drawn]
+    # A bar is as high as the most lines of a name, which would run into its neighbors'.
+    figure, (axes,) = panels(1, width=7.4, height=1.1 + max(0.34, 0.16 * max(map(len, titles)) + 0.08) * len(drawn))
+    for row, arm in enumerate(drawn):
+        left = 0.0
+        for part, ms in costs[arm.name].items():
+            index = parts.index(part)
+            hatch = "//" if part.startswith("effect") else None
+            axes.barh(row, ms, left=left, height=0.62, color=COLORS[index % len(COLORS)], hatch=hatch,
+                      edgecolor="white", linewidth=0.4, label="_")  # fmt: skip
+            left += ms
+    for index, part in enumerate(parts):
+        hatch = "//" if part.startswith("effect") else None
+        axes.barh([0], [0], color=COLORS[index % len(COLORS)], hatch=hatch, edgecolor="white", label=part)
+    axes.set_yticks(range(len(drawn)), ["\n".join(lines) for lines in titles])
+    axes.invert_yaxis()
+    axes.axvline(0, color=GREY, linewidth=0.8)
+    axes.set_xlabel("milliseconds that a frame takes longer with it")
+    figure.legend(loc="outside lower center", ncols=5, **LEGEND)
+    write_svg(figure, path)
+    return True
+
+
+def _frame_costs(arm: Variant) -> dict[str, float]:
+    """Returns node or effect -> mean milliseconds over the runs that recorded it."""
+    found: dict[str, list[float]] = {}
+    for costs in filter(None, (COSTS.find(record.folder) for record in arm.records)):
+        parts = {name: node.ms for name, node in costs.nodes.items()}
+        for part, ms in (parts | {f"effect: {name}": ms for name, ms in costs.effects.items()}).items():
+            found.setdefault(part, []).append(ms)
+    return {part: statistics.fmean(values) for part, values in found.items()}
+
+
+def _of(arms: Sequence[Variant], method: str) -> list[Variant]:
+    return [arm for arm in arms if arm.plain_label == method]
+
+
+def _line(look: Style) -> dict[str, Any]:
+    return {"color": look.color, "linestyle": look.dashes, "linewidth": 1.2, "alpha": 0.85, "label": look.kind}
+
+
+def _finish(axes: Axes, title: str, x_label: str) -> None:
+    axes.set_title(title, fontsize=10)
+    axes.set_xlabel(x_label)
+
+
+def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Adds a legend to each panel, or one below all of them if it would hide the curves."""
+    named = [dict(zip(*reversed(one.get_legend_handles_labels()), strict=True)) for one in axes]
+    if max(map(len, named)) <= _MOST_BESIDE_CURVES:
+        for one, once in zip(axes, named, strict=True):
+            one.legend(once.values(), once.keys(), **LEGEND)
+        return
+    once = {name: handle for some in named for name, handle in some.items()}
+    legend_below(figure, list(once.values()))
+
+
+_DASHES_FIGURES_README = {"plain": "-", "paper": "--", "paper_short": "--", "removal": ":"}
+
+
+def time_figure(arms: Sequence[Variant], protocol: Protocol, path: Path) -> None:
+    """Writes a PNG: held-out PSNR over training seconds and over milliseconds a frame, without controls.
+
+    Curves are means over scenes and seeds at each look. Without curves, only the end of training is drawn. Raises
+    ValueError if no run has a held-out PSNR.
+    """
+    shown = [arm for arm in arms if not arm.control and arm.mean(_psnr(protocol)) is not None]
+    if not shown:
+        raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
+    figure, (training, frame) = panels(2, width=4.6, height=4.0)
+    for arm in shown:
+        _over_training(training, arm, shown, protocol)
+        _points_figures_readme(frame, arm, shown, lambda run: run.latency.p50, protocol)
+    training.set_xlabel("training seconds")
+    frame.set_xlabel("milliseconds a frame")
+    training.set_ylabel("held-out PSNR, dB")
+    legend_below(figure, training.get_legend_handles_labels()[0])
+    FigureCanvasAgg(figure)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150, facecolor="white", metadata={"Software": None})
+
+
+def _psnr(protocol: Protocol) -> Value:
+    return lambda run: run.mean(protocol.psnr, HELD_OUT)
+
+
+def _over_training(axes: Axes, arm: Variant, shown: Sequence[Variant], protocol: Protocol) -> None:
+    curves = list(curves_of(arm).values())
+    if not curves:
+        _points_figures_readme(axes, arm, shown, _seconds, protocol)
+        return
+    mean = mean_curve(curves)
+    look, end = styles(shown)[arm.name], [len(mean.seconds) - 1]
+    dashes = _DASHES_FIGURES_README.get(look.kind, "-.")
+    paint = _paint_figures_readme(arm, shown)
+    axes.plot(
+        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(arm)
+    )
+
+
+def _paint_figures_readme(arm: Variant, shown: Sequence[Variant]) -> str:
+    """Returns the color of the arm's method, or of its sparsification if there is only one method."""
+    look = styles(shown)
+    own = look[arm.name]
+    return own.method if len({one.method for one in look.values()}) > 1 else own.color
+
+
+def _points_figures_readme(axes: Axes, arm: Variant, shown: Sequence[Variant], cost: Value, protocol: Protocol) -> None:
+    """Draws the mean, and every run small and pale."""
+    costs, qualities = arm.units(cost), arm.units(_psnr(protocol))
+    units = sorted(costs.keys() & qualities.keys())
+    if not units:
+        return
+    paint = _paint_figures_readme(arm, shown)
+    axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
+    scenes = (by_scene({unit: values[unit] for unit in units}) for values in (costs, qualities))
+    x, y = (statistics.fmean(means.values()) for means in scenes)
+    axes.scatter(x, y, s=44, color=paint, marker=styles(shown)[arm.name].marker, label=_label(arm), zorder=3)
+
+
+def _label(arm: Variant) -> str:
+    return f"{arm.title} (machine not quiet)" if arm.busy("frames") or arm.busy("training") else arm.title
+
+
+def _seconds(run: RunSummary) -> float | None:
+    return run.run.training_seconds

@@ -4,12 +4,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.records.quality import HELD_OUT
-from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Unit, Value, busy_arms, by_scene, mean_over_scenes, plain_of
-from sparsestreet.report.grid import Cell, Grid, number_cell
-from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
-from sparsestreet.report.notes import BUSY, CAPPED, CLOCKS
+from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.report.tables import (
+    BUSY,
+    CAPPED,
+    CLOCKS,
+    CONFIDENCE,
+    Cell,
+    ConfidenceInterval,
+    Grid,
+    number_cell,
+    t_interval,
+)
+from sparsestreet.report.variants import Unit, Value, Variant, busy_variants, by_scene, mean_over_scenes, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
 """Losses of full-image held-out PSNR, dB, that a smaller arm may have."""
@@ -56,7 +63,7 @@ def _held_out(metric: str) -> Value:
     return lambda run: run.mean(metric, HELD_OUT)
 
 
-def paired(arm: Arm, plain: Arm, value: Value, relative: bool = False) -> ConfidenceInterval | None:
+def paired(arm: Variant, plain: Variant, value: Value, relative: bool = False) -> ConfidenceInterval | None:
     """Returns the difference to the plain arm over the pairs of scene and seed that both arms have."""
     ours, theirs = arm.units(value), plain.units(value)
     differences = {
@@ -77,7 +84,7 @@ def interval_over_scenes(values: dict[Unit, float]) -> ConfidenceInterval | None
     return t_interval(list((scenes if len(scenes) > 1 else values).values()))
 
 
-def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
+def differences(arms: Sequence[Variant], protocol: Protocol) -> Grid:
     """Returns the table that compares every arm with the plain arm of its method at the same place."""
     shown = [one for one in measures(protocol) if any(arm.mean(one.value) is not None for arm in arms)]
     rows, alone = [], []
@@ -106,21 +113,21 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
     if alone:
         notes.append(f"no plain run (or several) at the same place to compare with: {', '.join(alone)}")
     header = (("", "arm - plain"), ("", "n"), *(("", f"{one.heading}{', %' if one.relative else ''}") for one in shown))
-    notes += [*_caps(arms), *busy_arms(arms)]
+    notes += [*_caps(arms), *busy_variants(arms)]
     return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
 
 
-def is_capped(plain: Arm) -> bool:
+def is_capped(plain: Variant) -> bool:
     """Whether a limit ended the growth of a run of the arm."""
     return any(record.summary.run.caps for record in plain.records)
 
 
-def _named(plain: Arm) -> str:
+def _named(plain: Variant) -> str:
     """Returns the name of a plain arm, marked where its count is a limit's."""
     return f"{plain.name} {CAPPED}" if is_capped(plain) else plain.name
 
 
-def _caps(arms: Sequence[Arm]) -> tuple[str, ...]:
+def _caps(arms: Sequence[Variant]) -> tuple[str, ...]:
     """Says what a share of a marked arm's Gaussians is a share of."""
     held = [arm.name for arm in arms if arm.sparsify == "none" and is_capped(arm)]
     said = "held down by max_gaussians, so that a share of its Gaussians is a share of that limit"
@@ -149,15 +156,15 @@ def _exactly(interval: ConfidenceInterval) -> str:
 
 @dataclass(frozen=True)
 class _Candidate:
-    arm: Arm
-    plain: Arm
+    arm: Variant
+    plain: Variant
     loss: float
     """dB; positive if it is worse."""
     share: float
     """Share of the plain arm's Gaussians that remains."""
 
 
-def _candidates(plain: Arm, arms: Sequence[Arm], protocol: Protocol) -> list[_Candidate]:
+def _candidates(plain: Variant, arms: Sequence[Variant], protocol: Protocol) -> list[_Candidate]:
     found = []
     for arm in arms:
         if plain_of(arm, arms) is not plain:
@@ -169,7 +176,7 @@ def _candidates(plain: Arm, arms: Sequence[Arm], protocol: Protocol) -> list[_Ca
     return found
 
 
-def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
+def matched_quality(arms: Sequence[Variant], protocol: Protocol) -> Grid:
     """Returns the arms with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
     rows, notes = [], [f"{_OF_THIS_SWEEP}: plain counts as its own candidate", _NO_CONTROLS]
     for plain in (arm for arm in arms if arm.sparsify == "none"):
@@ -179,11 +186,11 @@ def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
             rows.append((Cell(f"{_named(plain)}, at most {most:g} dB"), *_chosen(best)))
             if control is not None and (best is None or control.share < best.share):
                 notes.append(f"{rows[-1][0].text}: {_in_words(control)} is smaller")
-    notes += [*_caps(arms), *busy_arms(arms)]
+    notes += [*_caps(arms), *busy_variants(arms)]
     return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), tuple(notes))
 
 
-def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
+def matched_budget(arms: Sequence[Variant], protocol: Protocol) -> Grid:
     """Returns the arms with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
     rows, notes = [], [_OF_THIS_SWEEP, _NO_CONTROLS]
     for plain in (arm for arm in arms if arm.sparsify == "none"):
@@ -193,7 +200,7 @@ def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
             rows.append((Cell(f"{_named(plain)}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
             if control is not None and (best is None or control.loss < best.loss):
                 notes.append(f"{rows[-1][0].text}: {_in_words(control)} is better")
-    notes += [*_caps(arms), *busy_arms(arms)]
+    notes += [*_caps(arms), *busy_variants(arms)]
     return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), tuple(notes))
 
 
@@ -241,3 +248,70 @@ def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
 
 def _minutes(run: RunSummary) -> float | None:
     return None if run.run.training_seconds is None else run.run.training_seconds / 60
+
+
+LOSS = 0.3
+"""dB of full-image held-out PSNR that a smaller arm may lose on average."""
+FEWEST = 3
+"""Pairs of scenes, or of seeds of one scene, below which an interval says next to nothing: with two, a t interval is
+12.7 standard errors wide to each side."""
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """An arm beside its plain one, over the scenes and seeds that both have."""
+
+    arm: Variant
+    gain: ConfidenceInterval
+    """dB, negative if the arm is worse."""
+    kept: float
+    """Per cent of the plain arm's Gaussians."""
+
+
+def summary_line(arms: Sequence[Variant], protocol: Protocol) -> tuple[str, ...]:
+    """Returns a sentence for each plain arm, then what limits them; nothing for one whose others have too few pairs.
+
+    Controls are no way to get small and are left out. The mean of an arm decides, and its interval is stated: where it
+    reaches beyond the loss, a sentence says so.
+    """
+    found, wide, held = [], [], []
+    for plain in (arm for arm in arms if arm.sparsify == "none"):
+        compared = [one for arm in arms if plain_of(arm, arms) is plain and (one := _compared(arm, plain, protocol))]
+        if not compared:
+            continue
+        smaller = [one for one in compared if one.gain.mean >= -LOSS and one.kept < 100]
+        best = min(smaller, key=lambda one: one.kept, default=None)
+        found.append(_sentence(plain, compared, best))
+        wide += [best.arm.name] if best and best.gain.low is not None and best.gain.low < -LOSS else []
+        held += [plain.name] if is_capped(plain) else []
+    if wide:
+        found.append(
+            f"Intervals that reach beyond {LOSS:g} dB: {', '.join(wide)}. More scenes or seeds may change this."
+        )
+    if held:
+        found.append(f"A limit ended the growth of {', '.join(held)}: shares of it are shares of that limit.")
+    return tuple(found)
+
+
+def _compared(arm: Variant, plain: Variant, protocol: Protocol) -> _Compared | None:
+    if arm is plain or arm.control:
+        return None
+    gain = paired(arm, plain, lambda run: run.mean(protocol.psnr, HELD_OUT))
+    share = paired(arm, plain, lambda run: float(run.gaussians_total), relative=True)
+    if gain is None or share is None or gain.n < FEWEST:
+        return None
+    return _Compared(arm, gain, 100 + share.mean)
+
+
+def _sentence(plain: Variant, compared: Sequence[_Compared], best: _Compared | None) -> str:
+    of = f"of {len(compared)} arms " if len(compared) > 1 else ""
+    if best is None:
+        nearest = max(compared, key=lambda one: one.gain.mean)
+        return f"{plain.name}: {of}none is smaller within {LOSS:g} dB; {nearest.arm.name} has {_numbers(nearest)}."
+    return f"{plain.name}: {of}the smallest within {LOSS:g} dB is {best.arm.name}, with {_numbers(best)}."
+
+
+def _numbers(one: _Compared) -> str:
+    gain = one.gain
+    interval = "" if gain.low is None else f" [{gain.low:+.2f}, {gain.high:+.2f}]"
+    return f"{one.kept:.0f} % of the Gaussians, {gain.mean:+.2f} dB{interval} of held-out PSNR, n = {gain.n}"

@@ -11,10 +11,9 @@ from sparsestreet.cli import branch
 from sparsestreet.cli.branch import first_pruning, is_branch, moments_to_keep, trunk_of
 from sparsestreet.cli.compose import override_problem, resolved
 from sparsestreet.cli.train import train
-from sparsestreet.records.branch_of import BRANCH_OF, BranchOf
 from sparsestreet.records.configuration import Configuration, flat_config
 from sparsestreet.records.costs import update_costs
-from sparsestreet.records.run import RUN
+from sparsestreet.records.run import BRANCH_OF, RUN, BranchOf
 from sparsestreet.report.collect import collect
 from sparsestreet.report.sweep import _branches
 from tests.cli import configurations

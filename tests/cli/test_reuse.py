@@ -17,8 +17,7 @@ from sparsestreet.cli.reuse import finished_elsewhere, take_finished
 from sparsestreet.cli.sweep import finished
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.costs import COSTS, update_costs
-from sparsestreet.records.run import RUN
-from sparsestreet.records.same_as import SAME_AS
+from sparsestreet.records.run import RUN, SAME_AS
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.report.sweep import write_report
 from tests.cli import configurations

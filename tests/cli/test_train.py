@@ -20,8 +20,7 @@ from sparsestreet.metrics.lpips import ALEX
 from sparsestreet.metrics.lpips_weights import FOLDER_VARIABLE
 from sparsestreet.metrics.protocols import PROTOCOLS
 from sparsestreet.records.costs import COSTS
-from sparsestreet.records.novel import NOVEL
-from sparsestreet.records.presets import PRESETS
+from sparsestreet.records.renders import NOVEL, PRESETS
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.nodes import Rigid

@@ -9,7 +9,7 @@ from sparsestreet.pictures.effects import draw_effects
 from sparsestreet.records.costs import EffectGain, update_costs
 from sparsestreet.records.run import RUN
 from tests.evaluation.frames import make_summary
-from tests.report.test_effects import LENS
+from tests.report.test_costs import LENS
 
 
 def height(run: Path) -> int:

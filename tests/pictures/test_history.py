@@ -4,7 +4,7 @@ import pytest
 
 from sparsestreet.pictures import history
 from sparsestreet.pictures.history import draw_history
-from sparsestreet.records.ledger import LEDGER, MASK, PRUNING, CountChange
+from sparsestreet.records.curves import LEDGER, MASK, PRUNING, CountChange
 from sparsestreet.records.run import RUN
 from sparsestreet.records.strict_json import RecordError, write_atomically
 from sparsestreet.training.callbacks import mask_training, pruning

@@ -7,10 +7,18 @@ import os
 
 import pytest
 
-from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, FrameQuality, MetricSummary, RegionQuality
 from sparsestreet.records.run import RUN
 from sparsestreet.records.strict_json import RecordError, significant, write_atomically
-from sparsestreet.records.summary import SUMMARY, GuardCounts
+from sparsestreet.records.summary import (
+    HELD_OUT,
+    QUALITY,
+    SUMMARY,
+    TRAINING,
+    FrameQuality,
+    GuardCounts,
+    MetricSummary,
+    RegionQuality,
+)
 from tests.evaluation.frames import make_image, make_run, make_summary
 
 IMAGES = [

@@ -7,17 +7,24 @@ from typing import Any
 import pytest
 
 from sparsestreet.metrics.definitions import DEFINITIONS
-from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
+from sparsestreet.records.costs import STEP_PHASES, StepPhase
+from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, LOGGED, CountChange, HeldOutLook
 from sparsestreet.records.file import JsonFile
-from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.records.latency import LATENCY, ClockRow, Latency, Percentiles, clock_rows
-from sparsestreet.records.ledger import LEDGER, CountChange
-from sparsestreet.records.logged import LOGGED
-from sparsestreet.records.novel import NOVEL, NovelRecord, NovelShift
-from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
-from sparsestreet.records.quality import FrameQuality, MetricSummary, RegionQuality, camera_means, summarize
-from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
+from sparsestreet.records.renders import NOVEL, PRESETS, NovelRecord, NovelShift, PresetRecord, RenderedAs
+from sparsestreet.records.run import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
+from sparsestreet.records.summary import (
+    LATENCY,
+    ClockRow,
+    FrameQuality,
+    Latency,
+    MetricSummary,
+    Percentiles,
+    RegionQuality,
+    camera_means,
+    clock_rows,
+    summarize,
+)
 from tests.evaluation.frames import NOISE
 
 TABLES = [

@@ -5,10 +5,10 @@ import sys
 
 import pytest
 
-from sparsestreet.records.same_as import SAME_AS, SameAs
+from sparsestreet.records.run import SAME_AS, SameAs
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
-from sparsestreet.report import collect
+from sparsestreet.report.collect import collect
 from tests.evaluation.frames import make_summary
 
 

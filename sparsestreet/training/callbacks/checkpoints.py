@@ -12,7 +12,7 @@ from lightning import Callback, LightningModule, Trainer
 from sparsestreet.atomic import atomic_file, check_regular
 from sparsestreet.phases import stage
 from sparsestreet.ranks import LostProcessError
-from sparsestreet.records.branch_of import kept_before
+from sparsestreet.records.run import kept_before
 from sparsestreet.training.callbacks.graceful_stop import TornStop
 from sparsestreet.training.finite import check_parameters
 from sparsestreet.training.lightning import ends_step, ranks_of, validates_now

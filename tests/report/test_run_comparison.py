@@ -5,10 +5,9 @@ import pytest
 from PIL import Image
 
 from sparsestreet.pictures.images import picture_path, write_picture
-from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING
-from sparsestreet.records.summary import SUMMARY
-from sparsestreet.report import side_by_side
-from sparsestreet.report.side_by_side import compare_runs
+from sparsestreet.records.summary import HELD_OUT, QUALITY, SUMMARY, TRAINING
+from sparsestreet.report import run_comparison
+from sparsestreet.report.run_comparison import compare_runs
 from tests.evaluation.frames import make_image, make_summary
 from tests.evaluation.tiles import COLORS, make_picture
 from tests.pictures.test_sheets import LEGEND, order_of, row_within, written
@@ -79,7 +78,9 @@ def test_a_column_is_of_its_run(tmp_path, monkeypatch):
     """Two views of each; what is handed to the sheet, number by number."""
     drawn = []
     blank = np.zeros((2, 2, 3), dtype=np.uint8)
-    monkeypatch.setattr(side_by_side, "comparison_sheet", lambda columns, **how: drawn.append((columns, how)) or blank)
+    monkeypatch.setattr(
+        run_comparison, "comparison_sheet", lambda columns, **how: drawn.append((columns, how)) or blank
+    )
     runs = []
     for place, name in enumerate(("plain", "ours")):
         run = write_run(
@@ -103,7 +104,7 @@ def test_a_column_is_of_its_run(tmp_path, monkeypatch):
 def test_runs_that_hold_out_nothing_are_named_so_where_all_do(tmp_path, monkeypatch):
     titles = []
     blank = np.zeros((2, 2, 3), dtype=np.uint8)
-    monkeypatch.setattr(side_by_side, "comparison_sheet", lambda columns, title, **_: titles.append(title) or blank)
+    monkeypatch.setattr(run_comparison, "comparison_sheet", lambda columns, title, **_: titles.append(title) or blank)
     held_out = write_run(tmp_path / "a", COLORS["render"], 25.0, label="a")
     whole = write_run(tmp_path / "b", COLORS["render"], 30.0, TRAINING, label="b")
     assert picture_path(whole / "pictures", 3, 1, "truth").is_file()

@@ -5,7 +5,7 @@ import io
 
 import pytest
 
-from sparsestreet.report.grid import Cell, Grid, comma_separated, latex, markdown
+from sparsestreet.report.tables import Cell, Grid, comma_separated, latex, markdown
 
 GRID = Grid(
     "some",

@@ -1,11 +1,12 @@
-"""``records/novel.json``: the quality of a scene's renders next to the recorded path."""
+"""Renders that no photograph shows: next to the recorded path, and with other settings than in training."""
 
 from dataclasses import dataclass
 
 from sparsestreet.records.file import JsonFile
+from sparsestreet.records.run import Noise
 from sparsestreet.records.strict_json import version
 
-FORMAT = 2
+NOVEL_FORMAT = 2
 """Version of ``novel.json``; raised when a key changes its meaning."""
 
 TRUTH = ("psnr_full", "psnr_human", "psnr_vehicle", "lpips_alex")
@@ -37,7 +38,7 @@ class NovelShift:
 class NovelRecord:
     """The content of ``novel.json``."""
 
-    format: int = version(FORMAT, "evaluate again with novel=...")
+    format: int = version(NOVEL_FORMAT, "evaluate again with novel=...")
     command: str
     ramp: bool
     """Whether the shift grows from 0 at the first instant to its full value at the last, as in a change of lane."""
@@ -49,3 +50,42 @@ class NovelRecord:
 
 
 NOVEL = JsonFile("records/novel.json", NovelRecord)
+
+
+PRESETS_FORMAT = 1
+"""Version of ``presets.json``; raised when a key changes its meaning."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderedAs:
+    """One way to render the scene, measured on the same views as the record's other ways."""
+
+    preset: str
+    """Name of the settings, as in ``render.preset``."""
+    trained: bool
+    """Whether training rendered with the same settings."""
+    quality: dict[str, float]
+    """Id of a metric of ``DEFINITIONS`` -> its mean over the views that have it."""
+    psnr_to_exact: float
+    """PSNR against the same scene rendered without cut-off and early stop: mean over the views, dB."""
+    frame_ms: float
+    """Median milliseconds from a time and a pose to a uint8 image. The presets of a record were timed in turn at each
+    view, so times compare better within a record than between records."""
+    repeats: int
+    """Number of timed frames."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PresetRecord:
+    """The content of ``presets.json``."""
+
+    format: int = version(PRESETS_FORMAT, "evaluate again with presets=...")
+    command: str
+    device: str
+    threads: int
+    views: int
+    noise: Noise
+    rendered: tuple[RenderedAs, ...]
+
+
+PRESETS = JsonFile("records/presets.json", PresetRecord)

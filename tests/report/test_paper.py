@@ -7,11 +7,10 @@ import pytest
 
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
-from sparsestreet.records.failures import FailedRun
-from sparsestreet.records.quality import HELD_OUT, TRAINING, MetricSummary
-from sparsestreet.report.arms import Arm, arms
-from sparsestreet.report.layouts import metric_id, paper_table
-from sparsestreet.report.published import TABLES
+from sparsestreet.records.run import FailedRun
+from sparsestreet.records.summary import HELD_OUT, TRAINING, MetricSummary
+from sparsestreet.report.paper import TABLES, metric_id, paper_table
+from sparsestreet.report.variants import Variant, variants
 from tests.evaluation.frames import disturbed, make_summary
 from tests.report.sweep_folder import record
 from tests.typed import there
@@ -29,7 +28,7 @@ def found():
     """As training labels them: the method is omnire, the preset stands in the label."""
     for one in RUNS:
         object.__setattr__(one.summary.run, "method", "omnire")
-    return arms(RUNS)
+    return variants(RUNS)
 
 
 def rows_of(grid):
@@ -111,7 +110,7 @@ def test_every_column_of_ours_is_its_own(protocol):
                 quality=told_apart(quality))
         for split, quality in (("some", 0.0), ("none", 500.0))
     ]  # fmt: skip
-    found = arms([record(one, name) for one, name in zip(summaries, "ab", strict=True)])
+    found = variants([record(one, name) for one, name in zip(summaries, "ab", strict=True)])
     row = rows_of(paper_table(found, [], protocol, "table1_waymo"))["omnire"]
     values = {name: float(place) for place, name in enumerate(DEFINITIONS)}
     expected = {"method": "omnire", "n": "2", "Gaussians (M)": "2.5", "FPS": "125.0"}
@@ -130,7 +129,7 @@ def test_every_column_of_ours_is_its_own(protocol):
 
 def test_a_scene_on_all_views_alone_has_counts_and_speed_but_no_novel_views():
     only = make_summary("omnire", psnr=None, training_psnr=30.0, milliseconds=8.0, gaussians={"a": 10}, split="none")
-    row = rows_of(paper_table(arms([record(only)]), [], DRIVESTUDIO, "table1_waymo"))["omnire"]
+    row = rows_of(paper_table(variants([record(only)]), [], DRIVESTUDIO, "table1_waymo"))["omnire"]
     assert (row["FPS"].text, row["Gaussians (M)"].text) == ("125.0", "1e-05")
     assert (row["reconstruction full PSNR"].text, row["novel views full PSNR"].text) == ("30.00", "-")
 
@@ -143,7 +142,7 @@ def test_lpips_is_of_the_full_image(protocol, metric):
 
 
 def test_headers_and_notes_of_a_table():
-    found = arms([record(make_summary("omnire")), record(make_summary("omnire+random"))])
+    found = variants([record(make_summary("omnire")), record(make_summary("omnire+random"))])
     ablation = paper_table(found, [], DRIVESTUDIO, "table5_ablation")
     assert ablation.header[2:4] == (("novel views", "full PSNR"), ("novel views", "full PSNR, paper"))
     assert ablation.header[-2:] == (("", "Gaussians (M)"), ("", "Gaussians (M), paper"))
@@ -155,7 +154,7 @@ def test_headers_and_notes_of_a_table():
     assert any(note.startswith("reconstruction: of the training views of the runs") for note in ablation.notes)
     assert "failed runs are in no mean" not in ablation.notes
     assert f"protocol drivestudio: {', '.join(DRIVESTUDIO.metrics)}" in ablation.notes[2]
-    whole = arms([record(make_summary("omnire", psnr=None, training_psnr=30.0, split="none"))])
+    whole = variants([record(make_summary("omnire", psnr=None, training_psnr=30.0, split="none"))])
     of_any = paper_table(whole, [], DRIVESTUDIO, None)
     assert not any(note.startswith("reconstruction: of the training") for note in of_any.notes)
     assert of_any.title == "All arms, in the layout of the paper's Table 1"
@@ -173,7 +172,7 @@ def test_words_of_a_rows_options_choose_its_arm():
     for row in table.rows:
         name = " ".join((row.method or "", *row.options))
         summary = make_summary("x")
-        arm = Arm(name, "x", row.method or "", row.sparsify, (), (record(summary),))
+        arm = Variant(name, "x", row.method or "", row.sparsify, (), (record(summary),))
         grid = paper_table([arm], [], DRIVESTUDIO, "table3_pruning")
         assert grid.rows[[one.name for one in table.rows].index(row.name)][0].text == name
 
@@ -183,7 +182,7 @@ def test_frames_of_a_busy_machine_carry_the_mark_where_they_stand():
         make_summary("omnire", milliseconds=8.0),
         disturbed(make_summary("omnire+mine", milliseconds=16.0), "frames"),
     ]
-    grid = paper_table(arms([record(one) for one in runs]), [], DRIVESTUDIO, None)
+    grid = paper_table(variants([record(one) for one in runs]), [], DRIVESTUDIO, None)
     assert {name: row["FPS"].text for name, row in rows_of(grid).items()} == {
         "omnire": "125.0",
         "omnire+mine": "62.5 §",
@@ -193,9 +192,9 @@ def test_frames_of_a_busy_machine_carry_the_mark_where_they_stand():
 
 def test_columns_of_the_paper_without_a_number_are_left_out():
     """Of a method and data that the paper has not, nothing is published; of one that it has, every column is."""
-    own = paper_table(arms([record(make_summary("mine"))]), [], DRIVESTUDIO, None)
+    own = paper_table(variants([record(make_summary("mine"))]), [], DRIVESTUDIO, None)
     assert not any(heading.endswith("paper") for _, heading in own.header)
     assert len(own.header) == 2 + 14
     assert not any("paper" in note for note in own.notes)
-    both = paper_table(arms([record(make_summary("mine")), record(make_summary("pvg"))]), [], DRIVESTUDIO, None)
+    both = paper_table(variants([record(make_summary("mine")), record(make_summary("pvg"))]), [], DRIVESTUDIO, None)
     assert sum(heading.endswith("paper") for _, heading in both.header) == 14

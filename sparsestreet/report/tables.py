@@ -1,10 +1,15 @@
-"""Tables of plain cells, written as Markdown, LaTeX and CSV."""
+"""Tables of cells as Markdown, LaTeX and CSV, with the means, intervals and marks that their cells show."""
 
-from collections.abc import Sequence
+import math
+import statistics
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
+from scipy.special import stdtrit
+
 from sparsestreet.records.file import csv_text
+from sparsestreet.records.summary import RunSummary
 
 ABSENT = "-"
 
@@ -128,3 +133,86 @@ def comma_separated(grids: Sequence[Grid]) -> str:
                 marks = (int(cell.published), int(cell.bold), " ".join(cell.runs))
                 lines.append((grid.name, row[0].text, column, cell.text, *marks))
     return csv_text(("table", "row", "column", "value", "published", "bold", "runs"), lines)
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A mean with the sample standard deviation (n - 1); the latter is None below two values."""
+
+    mean: float
+    sd: float | None
+    n: int
+
+
+def spread(values: Sequence[float]) -> Spread | None:
+    """Returns mean and sample standard deviation; None without values.
+
+    >>> spread([24.0, 26.0, 28.0])
+    Spread(mean=26.0, sd=2.0, n=3)
+    """
+    if not values:
+        return None
+    return Spread(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None, len(values))
+
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class ConfidenceInterval:
+    """A mean with an interval that holds the true mean with ``CONFIDENCE`` if the differences are normal."""
+
+    mean: float
+    low: float | None
+    """None for a single value, which says nothing about its spread."""
+    high: float | None
+    n: int
+
+    @property
+    def proven(self) -> bool:
+        """Whether the interval excludes 0."""
+        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
+
+
+def t_interval(values: Sequence[float]) -> ConfidenceInterval | None:
+    """Returns the mean and the t interval with n - 1 degrees of freedom; None without values.
+
+    >>> interval = t_interval([0.2, 0.3, 0.4])
+    >>> f"{interval.mean:.2f} [{interval.low:.2f}, {interval.high:.2f}]", interval.proven
+    ('0.30 [0.05, 0.55]', True)
+    """
+    if not values:
+        return None
+    mean, n = statistics.fmean(values), len(values)
+    if n == 1:
+        return ConfidenceInterval(mean, None, None, 1)
+    reach = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2)) * statistics.stdev(values) / math.sqrt(n)
+    return ConfidenceInterval(mean, mean - reach, mean + reach, n)
+
+
+CAPPED = "†"
+"""Marks counts that a node's ``max_gaussians`` limited."""
+BUSY = "§"
+"""Marks times that are of a machine that was not quiet, as the ``noise`` of their record says."""
+
+
+def frames_steady(run: RunSummary) -> bool:
+    """Return whether the machine was quiet while frames were timed."""
+    return run.latency.noise.quiet
+
+
+def training_steady(run: RunSummary) -> bool:
+    """Return whether the machine was quiet while the run trained; a record that does not say counts as quiet."""
+    return run.run.noise is None or run.run.noise.quiet
+
+
+CLOCKS: dict[str, Callable[[RunSummary], bool]] = {"frames": frames_steady, "training": training_steady}
+"""What is timed -> whether its times are of a quiet machine."""
+
+
+def busy_note(named: Iterable[tuple[str, RunSummary]]) -> list[str]:
+    """Return a note that names the rows with marked times, for (name of a row, run) pairs; nothing without any."""
+    named = list(named)
+    busy = {what: sorted({name for name, run in named if not steady(run)}) for what, steady in CLOCKS.items()}
+    said = [f"{what} of {', '.join(names)}" for what, names in busy.items() if names]
+    return [f"{BUSY} times of a machine that was not quiet, compared with no other: {'; '.join(said)}"] if said else []

@@ -5,9 +5,8 @@ from pathlib import Path
 
 from sparsestreet.pictures.images import read_pictures, write_png
 from sparsestreet.pictures.sheets import Legend, SheetColumn, comparison_sheet
-from sparsestreet.records.quality import HELD_OUT, QUALITY
-from sparsestreet.records.summary import SUMMARY, RunSummary
-from sparsestreet.report.variants import variants
+from sparsestreet.records.summary import HELD_OUT, QUALITY, SUMMARY, RunSummary
+from sparsestreet.report.variants import repeats
 
 
 def compare_runs(
@@ -39,7 +38,7 @@ def compare_runs(
 
 def _names(summaries: Sequence[RunSummary]) -> list[str]:
     """Returns names as in the report's tables, with the seed if only the seed tells two runs apart."""
-    found = variants(summaries)
+    found = repeats(summaries)
     names = [next(variant.name for variant in found if summary in variant.runs) for summary in summaries]
     return [
         name if names.count(name) == 1 else f"{name} (seed {summary.run.seed})"
