@@ -81,7 +81,7 @@ def known_effects(overrides: Sequence[str]) -> "tuple[Mapping[str, EffectSetting
 
 def _plan(cfg: DictConfig, out: Path | None) -> Iterator[str]:
     from sparsestreet.cli.assemble import data_of, recipe_of, with_views
-    from sparsestreet.pictures.evidence import draw_evidence
+    from sparsestreet.pictures.plots import draw_evidence
 
     started = time.perf_counter()
     data = data_of(cfg)

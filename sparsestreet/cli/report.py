@@ -46,8 +46,8 @@ class ReportRequest:
     baseline: str | None = None
     sections: Literal["scenes", "mean", "all"] = "all"
     protocol: Literal["drivestudio", "strict"] = "drivestudio"
-    sections_markdown: Path | None = None
-    size_figure: Path | None = None
+    markdown: Path | None = None
+    figure: Path | None = None
     records: Path | None = None
 
     def __post_init__(self) -> None:
@@ -92,7 +92,7 @@ def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> Non
     written = write_report(folder, sweep_name(folder), protocol)
     if picture is not None:
         time_figure(variants(sweep_records(folder)), protocol, picture)
-    for sentence in (*written.notes, *written.verdict):
+    for sentence in (*written.notes, *written.summary_line):
         print(sentence)
     print(f"{written.folder}: tables.md, tables.tex, tables.csv, figures, index.html")
 

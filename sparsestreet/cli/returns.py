@@ -6,7 +6,7 @@ from pathlib import Path
 from sparsestreet.cli.compose import check_moved
 from sparsestreet.cli.named_log import reader_of
 from sparsestreet.cli.targets import open_run_config
-from sparsestreet.export.lidar import LidarReturns
+from sparsestreet.export.layers import LidarReturns
 from sparsestreet.records.run import RUN
 from sparsestreet.scene.views import RecordedViews
 

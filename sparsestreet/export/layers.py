@@ -3,28 +3,103 @@
 import colorsys
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8, UInt16
 from PIL import Image
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_folder
-from sparsestreet.export.lidar import FARTHEST, LidarReturns, enlarged
+from sparsestreet.data.lazy import Sweeps
+from sparsestreet.data.lidar import depth_image
 from sparsestreet.export.path import CameraPath
-from sparsestreet.export.seen import images_seen
 from sparsestreet.export.video import Picture, side_by_side
-from sparsestreet.ops import splat
+from sparsestreet.ops import contribution, splat
 from sparsestreet.pictures.images import color_map
 from sparsestreet.scene.centers import node_legend
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.scene.storage import StoredScene
-from sparsestreet.types import View
+from sparsestreet.types import Camera, View
+
+_COLUMN = "images_seen"
+
+
+@torch.no_grad()
+def count_images(stored: StoredScene, views: Iterable[View]) -> None:
+    """Gives the rows of all nodes a column: the number of views in which a Gaussian shows.
+
+    It shows where it has the largest part of at least one pixel, as in the paper's importance. What another Gaussian
+    hides has no such pixel. Objects that are edited, moved or copied later take their counts along.
+    """
+    counts = {
+        name: torch.zeros(len(node.rows), dtype=torch.int64, device=node.rows.means.device)
+        for name, node in stored.scene.nodes.items()
+    }
+    for view in views:
+        placed = stored.scene.gaussians_at(view)
+        options = stored.options
+        counted = contribution(placed.gaussians, placed.view.camera, settings=options.settings, backend=options.backend)
+        for name, rows in placed.spans.items():
+            counts[name] += counted.dominant[rows] > 0
+    for name, node in stored.scene.nodes.items():
+        node.rows.register_buffer(_COLUMN, counts[name], persistent=False)
+
+
+def images_seen(scene: SceneGraph, spans: Mapping[str, slice]) -> Float[Tensor, " n"]:
+    """Returns the counts in the order of a rendering's rows; 0 for what the recorded images never had.
+
+    Raises ValueError where no node has counts.
+    """
+    columns = {name: scene.nodes[name].rows.columns() for name in spans}
+    if not any(_COLUMN in found for found in columns.values()):
+        raise ValueError("nobody has counted the recorded images of this scene: call count_images before it is edited")
+    return torch.cat([found.get(_COLUMN, torch.zeros_like(found["means"][:, 0])).float() for found in columns.values()])
+
+
+FARTHEST = 65_535
+"""Millimeters of a depth that is no smaller; 0 where there is none."""
+
+
+class LidarReturns:
+    """The sweeps of a log, each at its time."""
+
+    def __init__(self, sweeps: Sweeps, times: Mapping[int, float]) -> None:
+        """``times``: frame of each sweep -> normalized time."""
+        self.times = times
+        self._load = sweeps.load_gray
+        self._read: tuple[int, Float[Tensor, "n 3"]] | None = None
+
+    def points(self, time: float) -> Float[Tensor, "n 3"]:
+        """Returns of the sweep that is nearest in time, in the world; cameras of an instant share one reading."""
+        frame = min(self.times, key=lambda frame: abs(self.times[frame] - time))
+        if self._read is None or self._read[0] != frame:
+            self._read = frame, self._load(frame).points
+        return self._read[1]
+
+    def millimeters(self, camera: Camera, time: float) -> UInt16[np.ndarray, "h w"]:
+        """Depth along the optical axis of the nearest return in each pixel; 0: none; see ``FARTHEST``.
+
+        The lens is followed, a rolling shutter is not: all returns are where the sweep has them.
+        """
+        depth = depth_image(self.points(time), camera)
+        millimeters = (1000 * depth).round().clamp(max=FARTHEST)
+        return millimeters.numpy().astype(np.uint16)
+
+
+def enlarged(values: UInt16[np.ndarray, "h w"], side: int) -> UInt16[np.ndarray, "h w"]:
+    """Each value as a square of so many pixels, to the right and down; the nearer one where two of them meet."""
+    found = np.where(values > 0, values.astype(np.int64), FARTHEST + 1)
+    padded = np.pad(found, ((side - 1, 0), (side - 1, 0)), constant_values=FARTHEST + 1)
+    height, width = found.shape
+    found = np.min([padded[y : y + height, x : x + width] for y in range(side) for x in range(side)], axis=0)
+    return np.where(found > FARTHEST, 0, found).astype(np.uint16)
+
 
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
 """Those that are of the scene; ``lidar`` is of the log, ``seen`` of its images."""

@@ -21,7 +21,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.pictures.history import count_curves, marks
+from sparsestreet.pictures.plots import count_curves, marks
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.curves import LEDGER
 from sparsestreet.records.summary import HELD_OUT, RunSummary

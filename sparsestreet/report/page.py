@@ -40,7 +40,7 @@ class Page:
     """The JSON of ``comparison.comparison_data``."""
     records: Sequence[RunRecord]
     failures: Sequence[tuple[Path, FailedRun]]
-    verdict: Sequence[str] = ()
+    summary_line: Sequence[str] = ()
     """Sentences that say what follows from the numbers; none where the runs are too few."""
 
 
@@ -51,7 +51,7 @@ def html(page: Page) -> str:
         f"<h1>{escape(page.title)}</h1>",
         f"<p class='soft'>{len(page.records)} runs with a record, {len(page.failures)} failed. "
         "Every number links to the runs that it is of, with their records, configurations and commits.</p>",
-        _verdict(page.verdict),
+        _summary_line(page.summary_line),
         _navigation(page),
         _notes(page.notes),
         *(_grid(grid, sets) for grid in page.grids),
@@ -91,7 +91,7 @@ def _notes(notes: Sequence[str]) -> str:
     return "<ul class='notes'>" + "".join(f"<li>{escape(note)}</li>" for note in notes) + "</ul>" if notes else ""
 
 
-def _verdict(sentences: Sequence[str]) -> str:
+def _summary_line(sentences: Sequence[str]) -> str:
     if not sentences:
         return ""
     return "<section id='verdict'>" + "".join(f"<p>{escape(one)}</p>" for one in sentences) + "</section>"

@@ -69,7 +69,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
         pictures=comparison_data(found),
         records=records,
         failures=failures,
-        verdict=said,
+        summary_line=said,
     )
     write_atomically(folder / "index.html", html(page))
     return SweepReport(folder, tuple(grids), tuple(notes), said)

@@ -17,10 +17,10 @@ from PIL import Image
 from sparsestreet.cli import scene
 from sparsestreet.cli.compose import load_run_config
 from sparsestreet.cli.render import USAGE, RenderRequest, render
-from sparsestreet.export import rig, video
-from sparsestreet.export.layers import LAYERS, layer_values
+from sparsestreet.export import path as rig
+from sparsestreet.export import video
+from sparsestreet.export.layers import LAYERS, count_images, layer_values
 from sparsestreet.export.path import recorded, resized, shifted
-from sparsestreet.export.seen import count_images
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.edits import REMOVED, Edits, edited

@@ -9,7 +9,7 @@ import zlib
 import pytest
 import zstandard
 
-from sparsestreet.codec import limits
+from sparsestreet.codec import container
 from sparsestreet.codec.container import LARGEST, MAGIC, VERSION, FrameReader, FrameWriter
 
 CONTENTS = [b"", b"a", bytes(range(256)) * 40]
@@ -105,7 +105,7 @@ def test_absurd_sizes_are_refused_with_little_memory(content: bytes):
 
 
 def test_many_small_frames_that_unpack_to_much_are_refused(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(limits, "FREE", 2**20)
+    monkeypatch.setattr(container, "FREE", 2**20)
     zeros = zstandard.compress(bytes(2**19))
     reader = FrameReader(io.BytesIO(file_of(*[frame(b"DATA", zeros, 2**19)] * 9)))
     with pytest.raises(ValueError, match=r"the file has \d+ bytes and claims \d+ unpacked, above its limit of"):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sparsestreet.codec.gaussians import LEVELS, Block, Steps, packed_block, unpacked_block
-from sparsestreet.codec.harmonics import along_axes
+from sparsestreet.codec.vectors import along_axes
 from tests.codec.blocks import block, form
 
 STEPS = Steps(0.002)

@@ -255,7 +255,7 @@ def test_columns_without_any_published_number_are_left_out():
 
 
 def test_the_verdict_comes_first_and_only_if_there_is_one():
-    text = whole(verdict=("<this> arm.", "And so on."))
+    text = whole(summary_line=("<this> arm.", "And so on."))
     assert "<section id='verdict'><p>&lt;this&gt; arm.</p><p>And so on.</p></section>\n<nav>" in text
     assert "id='verdict'" not in whole()
 

@@ -9,7 +9,7 @@ import torch
 
 from sparsestreet.geometry.transforms import inverse
 from sparsestreet.viewing.edit_state import EditState, Offset
-from sparsestreet.viewing.poses import eye_of, matrix, wxyz_of
+from sparsestreet.viewing.object_panel import eye_of, matrix, wxyz_of
 from sparsestreet.viewing.stage import Eye, RecordedCamera, Stage
 from tests.export.street import stored_street, street_views
 

@@ -13,10 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.export.check import PROGRAM, check_file, read_plain_ply, turned_camera
 from sparsestreet.export.frame import VIEWER_FROM_WORLD, frame_gaussians, turned
 from sparsestreet.export.ply import write_ply
-from sparsestreet.export.spz import read_spz, spz_notes, write_spz
+from sparsestreet.export.spz import PROGRAM, check_file, read_plain_ply, read_spz, spz_notes, turned_camera, write_spz
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.types import Gaussians
 from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street, street_views

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.export.check import read_plain_ply
 from sparsestreet.export.frame import turned
-from sparsestreet.export.object_files import write_objects
+from sparsestreet.export.objects import write_objects
 from sparsestreet.export.ply import scene_gaussians
+from sparsestreet.export.spz import read_plain_ply
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Smpl
 from sparsestreet.scene.rendering import RenderOptions
