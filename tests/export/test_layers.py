@@ -196,6 +196,19 @@ def test_a_pixel_has_the_mean_of_its_gaussians_by_their_weights():
     assert value == pytest.approx((10 * car + 200 * (whole - car)) / whole, abs=0.51)  # rounded
 
 
+def test_a_pixel_half_covered_has_the_whole_count():
+    """One Gaussian that 40 images saw covers 0.6 of a pixel, and nothing is behind it: 40, not 24."""
+    stored = hidden_road()
+    with torch.no_grad():
+        for rows in (stored.scene.nodes[name].rows for name in ("background", "rigid")):
+            rows.opacity_logits[:] = -20.0
+        stored.scene.nodes["rigid"].rows.opacity_logits[0] = 0.5
+    count_images(stored, FRONT)
+    stored.scene.nodes["rigid"].rows.images_seen[0] = 40
+    assert 0.55 < float(stored.render(FRONT[0]).alpha[16, 24]) < 0.65
+    assert layer_values(stored, FRONT[0], ["seen"])["seen"][16, 24] == 40
+
+
 def test_more_than_255_images_are_255_and_few_are_dark():
     stored = hidden_road()
     count_images(stored, FRONT)
