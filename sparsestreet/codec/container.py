@@ -50,7 +50,7 @@ class Budget:
 MAGIC = b"\x89STREET\n"
 """The first byte is no text, the last one changes where a program takes the file for text."""
 VERSION = 1
-LARGEST = 2**26
+MAX_FRAME = 2**26
 """Bytes that a frame may unpack to."""
 LEVEL = 19
 """Of zstd: 3 % less than level 12."""
@@ -79,15 +79,15 @@ class FrameWriter:
     def write(self, tag: str, pieces: Sequence[bytes]) -> int:
         """Writes a frame and returns the bytes that it takes; statistics of a piece serve this piece alone.
 
-        Raises ValueError for more than ``LARGEST`` bytes.
+        Raises ValueError for more than ``MAX_FRAME`` bytes.
         """
         self._count += 1
         return self._write(tag.encode("ascii"), pieces)
 
     def _write(self, tag: bytes, pieces: Sequence[bytes]) -> int:
         unpacked = sum(map(len, pieces))
-        if unpacked > LARGEST:
-            raise ValueError(f"a frame holds at most {LARGEST} bytes, got {unpacked}: write several")
+        if unpacked > MAX_FRAME:
+            raise ValueError(f"a frame holds at most {MAX_FRAME} bytes, got {unpacked}: write several")
         stored = b"".join(self._compressor.compress(piece) for piece in pieces)
         sizes = _SIZES.pack(tag, len(stored), unpacked)
         self._file.write(sizes + struct.pack("<I", zlib.crc32(stored, zlib.crc32(sizes))) + stored)
@@ -105,7 +105,7 @@ class FrameReader:
         self._file, self._count = file, 0
         self.budget = Budget(file.seek(0, io.SEEK_END))
         file.seek(0)
-        self._decompressor = _zstandard().ZstdDecompressor(max_window_size=LARGEST)
+        self._decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_FRAME)
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError("it does not start as a .street does")
         (version,) = _VERSION.unpack(self._exactly(_VERSION.size))
@@ -128,8 +128,8 @@ class FrameReader:
         tag, stored, unpacked, checksum = _FRAME.unpack(head)
         if tag != wanted:
             raise ValueError(f"a part {wanted.decode()!r} should follow, got {tag!a}: it is damaged")
-        if unpacked > LARGEST or stored > LARGEST:
-            raise ValueError(f"a part claims {max(unpacked, stored)} bytes, at most {LARGEST} are allowed")
+        if unpacked > MAX_FRAME or stored > MAX_FRAME:
+            raise ValueError(f"a part claims {max(unpacked, stored)} bytes, at most {MAX_FRAME} are allowed")
         self.budget.take(unpacked)
         content = self._exactly(stored)
         if zlib.crc32(content, zlib.crc32(head[: _SIZES.size])) != checksum:

@@ -62,7 +62,7 @@ def images_seen(scene: SceneGraph, spans: Mapping[str, slice]) -> Float[Tensor, 
     return torch.cat([found.get(_COLUMN, torch.zeros_like(found["means"][:, 0])).float() for found in columns.values()])
 
 
-FARTHEST = 65_535
+MAX_MILLIMETERS = 65_535
 """Millimeters of a depth that is no smaller; 0 where there is none."""
 
 
@@ -83,22 +83,22 @@ class LidarReturns:
         return self._read[1]
 
     def millimeters(self, camera: Camera, time: float) -> UInt16[np.ndarray, "h w"]:
-        """Depth along the optical axis of the nearest return in each pixel; 0: none; see ``FARTHEST``.
+        """Depth along the optical axis of the nearest return in each pixel; 0: none; see ``MAX_MILLIMETERS``.
 
         The lens is followed, a rolling shutter is not: all returns are where the sweep has them.
         """
         depth = depth_image(self.points(time), camera)
-        millimeters = (1000 * depth).round().clamp(max=FARTHEST)
+        millimeters = (1000 * depth).round().clamp(max=MAX_MILLIMETERS)
         return millimeters.numpy().astype(np.uint16)
 
 
 def enlarged(values: UInt16[np.ndarray, "h w"], side: int) -> UInt16[np.ndarray, "h w"]:
     """Each value as a square of so many pixels, to the right and down; the nearer one where two of them meet."""
-    found = np.where(values > 0, values.astype(np.int64), FARTHEST + 1)
-    padded = np.pad(found, ((side - 1, 0), (side - 1, 0)), constant_values=FARTHEST + 1)
+    found = np.where(values > 0, values.astype(np.int64), MAX_MILLIMETERS + 1)
+    padded = np.pad(found, ((side - 1, 0), (side - 1, 0)), constant_values=MAX_MILLIMETERS + 1)
     height, width = found.shape
     found = np.min([padded[y : y + height, x : x + width] for y in range(side) for x in range(side)], axis=0)
-    return np.where(found > FARTHEST, 0, found).astype(np.uint16)
+    return np.where(found > MAX_MILLIMETERS, 0, found).astype(np.uint16)
 
 
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
@@ -114,9 +114,9 @@ _DOTS = 320
 """Dots of the lidar that fit side by side into a picture, at most."""
 _NEAR, _FAR = 1.0, 100.0
 """Meters of the lightest and of the darkest color in a picture of depth."""
-_MANY = 32
+_ENOUGH_IMAGES = 32
 """Images that have seen enough: the lightest color in a picture of ``seen``."""
-_MOST = 255
+_MAX_IMAGES = 255
 _FIRST_HARMONIC = 0.28209479177387814
 
 
@@ -161,7 +161,7 @@ def layer_values(
         elif layer == "alpha":
             found[layer] = (rendering.alpha.clamp(0, 1) * 255).round().byte().cpu().numpy()
         elif layer == "depth":
-            millimeters = (1000 * rendering.depth).round().clamp(1, FARTHEST)
+            millimeters = (1000 * rendering.depth).round().clamp(1, MAX_MILLIMETERS)
             shown = torch.where(rendering.alpha >= _SOLID, millimeters, 0.0)
             found[layer] = shown.cpu().numpy().astype(np.uint16)
         elif layer == "lidar":
@@ -191,7 +191,7 @@ def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Pictu
     if layer == "depth":
         return np.where(values[..., None] > 0, _by_distance(values), 0).astype(np.uint8)
     if layer == "seen":
-        return color_map(np.log2(1.0 + values) / np.log2(1.0 + _MANY))
+        return color_map(np.log2(1.0 + values) / np.log2(1.0 + _ENOUGH_IMAGES))
     if layer == "lidar":
         dots = enlarged(values, math.ceil(values.shape[1] / _DOTS))
         return np.where(dots[..., None] > 0, _by_distance(dots), 0 if under is None else under // 2).astype(np.uint8)
@@ -264,10 +264,10 @@ def tables(stored: StoredScene, layers: Sequence[str]) -> Mapping[str, Any]:
 
 def _seen(stored: StoredScene, view: View, rendering: SceneRendering) -> UInt8[np.ndarray, "h w"]:
     """Images that showed what the pixel shows, rounded; 0 also where the pixel has no depth."""
-    share = images_seen(stored.scene, rendering.spans).clamp(max=_MOST) / _MOST
+    share = images_seen(stored.scene, rendering.spans).clamp(max=_MAX_IMAGES) / _MAX_IMAGES
     summed = _splatted(stored, stored.scene.seen(view), rendering, share[:, None].expand(-1, 3))[..., 0]
-    mean = _MOST * summed / rendering.alpha.clamp(min=_SOLID)
-    return torch.where(rendering.alpha >= _SOLID, mean.round().clamp(0, _MOST), 0.0).byte().cpu().numpy()
+    mean = _MAX_IMAGES * summed / rendering.alpha.clamp(min=_SOLID)
+    return torch.where(rendering.alpha >= _SOLID, mean.round().clamp(0, _MAX_IMAGES), 0.0).byte().cpu().numpy()
 
 
 def _node_ids(rendering: SceneRendering) -> Int[Tensor, " n"]:

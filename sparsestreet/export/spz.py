@@ -29,7 +29,7 @@ from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.types import Camera, Gaussians
 
 MAGIC, VERSION = 0x5053474E, 3
-LARGEST_COUNT = 10_000_000
+MAX_COUNT = 10_000_000
 """Gaussians that other programs take."""
 
 _HEADER = struct.Struct("<IIIBBBB")
@@ -49,14 +49,12 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
 
     Rounding: positions 2**-13 m within 2,048 m (twice that for each time it is twice as far), log scales 1 / 32 in
     [-10, 5.9], opacities 1 / 510, parts of quaternions 0.0007, the first harmonic 1 / 77 in [-3.3, 3.3], the others
-    1 / 256 in [-1, 1). Raises ValueError for more than ``LARGEST_COUNT`` Gaussians or numbers that are not finite.
+    1 / 256 in [-1, 1). Raises ValueError for more than ``MAX_COUNT`` Gaussians or numbers that are not finite.
     """
     check_gaussians(gaussians)
     found = turned(gaussians, _RIGHT_UP_BACK)
-    if len(found) > LARGEST_COUNT:
-        raise ValueError(
-            f"a .spz holds at most {LARGEST_COUNT:,} Gaussians, got {len(found):,}: prune, or choose nodes"
-        )
+    if len(found) > MAX_COUNT:
+        raise ValueError(f"a .spz holds at most {MAX_COUNT:,} Gaussians, got {len(found):,}: prune, or choose nodes")
     means, sh = found.means.double().numpy(), found.sh.double().numpy()
     bits = _fraction_bits(float(np.abs(means).max(initial=0)))
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
@@ -101,8 +99,8 @@ def read_spz(path: Path) -> Gaussians:
             head = stream.read(_HEADER.size)
             magic, version, count, degree, bits, _, _ = _HEADER.unpack(head)
             terms = (degree + 1) ** 2
-            if magic != MAGIC or version != VERSION or degree > 3 or bits > 23 or count > LARGEST_COUNT:
-                raise ValueError(f"{path} is no .spz of version {VERSION} with at most {LARGEST_COUNT:,} Gaussians")
+            if magic != MAGIC or version != VERSION or degree > 3 or bits > 23 or count > MAX_COUNT:
+                raise ValueError(f"{path} is no .spz of version {VERSION} with at most {MAX_COUNT:,} Gaussians")
             size = count * (20 + 3 * (terms - 1))
             content = stream.read(size + 1)
         except (OSError, EOFError, struct.error, zlib.error) as error:

@@ -20,7 +20,7 @@ from sparsestreet.records.run import RUN
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 _MARKERS = "osD^vP*"  # one fewer than colors, so that pairs of both repeat late
 _DASHES = ("--", ":", "-.")
-_FEW_DECADES = 300
+_MAX_FULL_TICKS = 300
 """Ratio of the ends of an axis below which 2 and 5 times a power of ten have labels."""
 
 
@@ -55,7 +55,7 @@ def plot_counts(
     axes.yaxis.set_major_formatter(labels)
     low, high = axes.get_ylim()
     # Within a decade or two the powers of ten are too few to read a count by.
-    axes.yaxis.set_minor_formatter(labels if high < _FEW_DECADES * low else NullFormatter())
+    axes.yaxis.set_minor_formatter(labels if high < _MAX_FULL_TICKS * low else NullFormatter())
     axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     _finish(figure, axes, path)
 

@@ -29,25 +29,25 @@ _COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] 
 )
 
 
-def what_variants_cost(arms: Sequence[Variant]) -> Grid:
-    """Returns size, speed, time and memory of every arm, as means over its runs."""
-    shown = [column for column in _COLUMNS if any(_mean(arm, column[3]) is not None for arm in arms)]
+def what_variants_cost(variants: Sequence[Variant]) -> Grid:
+    """Returns size, speed, time and memory of every variant, as means over its runs."""
+    shown = [column for column in _COLUMNS if any(_mean(variant, column[3]) is not None for variant in variants)]
     rows = []
-    for arm in arms:
-        runs = tuple(record.folder.name for record in arm.records)
+    for variant in variants:
+        runs = tuple(record.folder.name for record in variant.records)
         clocks = [_CLOCK_OF.get(group or heading) for group, heading, _, _ in shown]
-        marks = [arm.busy(clock) if clock else "" for clock in clocks]
+        marks = [variant.busy(clock) if clock else "" for clock in clocks]
         cells = [
-            number_cell(_mean(arm, value), form, runs, mark)
+            number_cell(_mean(variant, value), form, runs, mark)
             for (_, _, form, value), mark in zip(shown, marks, strict=True)
         ]
-        rows.append((Cell(arm.title, runs=runs), Cell(str(len(runs)), runs=runs), *cells))
+        rows.append((Cell(variant.title, runs=runs), Cell(str(len(runs)), runs=runs), *cells))
     header = (("", "arm"), ("", "n"), *((group, heading) for group, heading, _, _ in shown))
     notes = [
         "means over the runs of an arm; train s: steps and pruning, without evaluation; whole command: from the import "
         "of torch to the pictures; a step: medians over the steps that records/phases.csv notes"
     ]
-    return Grid("costs", "What each arm costs", header, tuple(rows), (*notes, *busy_variants(arms)))
+    return Grid("costs", "What each arm costs", header, tuple(rows), (*notes, *busy_variants(variants)))
 
 
 def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float | None:
@@ -65,8 +65,8 @@ def _step(costs: CostRecord, *parts: str) -> float | None:
     return sum(found) if found else None
 
 
-def _mean(arm: Variant, value: Callable[[RunRecord], float | None]) -> float | None:
-    found = [number for record in arm.records if (number := value(record)) is not None]
+def _mean(variant: Variant, value: Callable[[RunRecord], float | None]) -> float | None:
+    found = [number for record in variant.records if (number := value(record)) is not None]
     return statistics.fmean(found) if found else None
 
 
@@ -78,34 +78,40 @@ _HEADER = (
 )
 
 
-def what_effects_cost(arms: Sequence[Variant]) -> Grid:
-    """Returns a row for each effect of each arm's plan; numbers are means over the arm's runs."""
-    rows = [row for arm in arms for row in _rows(arm)]
+def what_effects_cost(variants: Sequence[Variant]) -> Grid:
+    """Returns a row for each effect of each variant's plan; numbers are means over the variant's runs."""
+    rows = [row for variant in variants for row in _rows(variant)]
     notes = [
         "measured: frames and PSNR of the finished scene with the effect, less those without it; a scene that was "
         "trained without the effect would have made up for a part"
     ]
-    if busy := [arm.name for arm in arms if _busy([COSTS.find(record.folder) for record in arm.records])]:
+    if busy := [
+        variant.name for variant in variants if _busy([COSTS.find(record.folder) for record in variant.records])
+    ]:
         notes.append(f"{BUSY} times of a machine that was not quiet, compared with no other: {', '.join(busy)}")
     return Grid("effects", "What each effect costs and brings", _HEADER, tuple(rows), tuple(notes))
 
 
-def effects_alike(arms: Sequence[Variant]) -> str | None:
-    """Returns which effects are on, in a sentence, if they are the same in all arms; None if arms differ in them."""
-    plans = {tuple((one.name, one.on) for one in record.summary.run.effects) for arm in arms for record in arm.records}
+def effects_alike(variants: Sequence[Variant]) -> str | None:
+    """Return which effects are on, in a sentence, if all variants have the same ones; None if they differ."""
+    plans = {
+        tuple((one.name, one.on) for one in record.summary.run.effects)
+        for variant in variants
+        for record in variant.records
+    }
     if len(plans) != 1:
         return None
     on = [name for name, is_on in next(iter(plans)) if is_on]
     return f"all arms have the same effects ({', '.join(on) or 'none'})"
 
 
-def _rows(arm: Variant) -> list[tuple[Cell, ...]]:
-    plans = [{one.name: one for one in record.summary.run.effects} for record in arm.records]
-    costs = [COSTS.find(record.folder) for record in arm.records]
-    runs = tuple(record.folder.name for record in arm.records)
+def _rows(variant: Variant) -> list[tuple[Cell, ...]]:
+    plans = [{one.name: one for one in record.summary.run.effects} for record in variant.records]
+    costs = [COSTS.find(record.folder) for record in variant.records]
+    runs = tuple(record.folder.name for record in variant.records)
     names = list(dict.fromkeys(name for plan in plans for name in plan))
     return [
-        tuple(Cell(text, runs=runs) for text in (arm.title, *_cells(name, [plan[name] for plan in plans], costs)))
+        tuple(Cell(text, runs=runs) for text in (variant.title, *_cells(name, [plan[name] for plan in plans], costs)))
         for name in names
         if all(name in plan for plan in plans)
     ]
@@ -164,16 +170,18 @@ class QualityCurve:
     """Full image, dB."""
 
 
-def curves_of_runs(arm: Variant) -> dict[Unit, list[QualityCurve]]:
+def curves_of_runs(variant: Variant) -> dict[Unit, list[QualityCurve]]:
     """Returns scene and seed -> the curves of its runs, for the runs that hold views out and have a curve."""
-    found = {unit: [_curve(HELD_OUT_CURVE.find(run.folder) or ()) for run in runs] for unit, runs in arm.runs().items()}
+    found = {
+        unit: [_curve(HELD_OUT_CURVE.find(run.folder) or ()) for run in runs] for unit, runs in variant.runs().items()
+    }
     known = {unit: [curve for curve in curves if curve.seconds] for unit, curves in found.items()}
     return {unit: curves for unit, curves in known.items() if curves}
 
 
-def curves_of(arm: Variant) -> dict[Unit, QualityCurve]:
+def curves_of(variant: Variant) -> dict[Unit, QualityCurve]:
     """Returns scene and seed -> the curve of its run, or the mean of several runs."""
-    return {unit: mean_curve(curves) for unit, curves in curves_of_runs(arm).items()}
+    return {unit: mean_curve(curves) for unit, curves in curves_of_runs(variant).items()}
 
 
 def mean_curve(curves: Sequence[QualityCurve]) -> QualityCurve:
@@ -201,27 +209,29 @@ def seconds_to(curve: QualityCurve, psnr: float) -> float | None:
     return next((at for at, value in zip(curve.seconds, curve.psnr, strict=True) if value >= psnr), None)
 
 
-def time_to_quality(arms: Sequence[Variant]) -> Grid | None:
+def time_to_quality(variants: Sequence[Variant]) -> Grid | None:
     """Returns median seconds to the plain run's last PSNR minus 1, 0.5 and 0.1 dB; None if no run has a curve."""
-    curves = {arm.name: curves_of(arm) for arm in arms}
+    curves = {variant.name: curves_of(variant) for variant in variants}
     if not any(curves.values()):
         return None
     rows = []
-    for arm in arms:
-        plain = plain_of(arm, arms)
-        if plain is None or not curves[arm.name]:
+    for variant in variants:
+        plain = plain_of(variant, variants)
+        if plain is None or not curves[variant.name]:
             continue
-        runs = tuple(record.folder.name for record in arm.records)
-        times = [_reached(curves[arm.name], curves[plain.name], below) for below in BELOW]
-        cells = [Cell(f"{time} {arm.busy('training') if ' s' in time else ''}".rstrip(), runs=runs) for time in times]
-        rows.append((Cell(arm.title, runs=runs), *cells))
+        runs = tuple(record.folder.name for record in variant.records)
+        times = [_reached(curves[variant.name], curves[plain.name], below) for below in BELOW]
+        cells = [
+            Cell(f"{time} {variant.busy('training') if ' s' in time else ''}".rstrip(), runs=runs) for time in times
+        ]
+        rows.append((Cell(variant.title, runs=runs), *cells))
     header = (("", "arm"), *(("", f"base - {below:g} dB") for below in BELOW))
     notes = (
         "training seconds, evaluation left out, to the first look at held-out views that is as good: the median of the "
         "runs that get there; base: the last look of the plain run of the same scene and seed",
         "a look is a fixed probe of held-out views; nothing is interpolated between two looks",
     )
-    return Grid("time_to_quality", "Time to quality", header, tuple(rows), (*notes, *busy_variants(arms)))
+    return Grid("time_to_quality", "Time to quality", header, tuple(rows), (*notes, *busy_variants(variants)))
 
 
 def _reached(ours: dict[Unit, QualityCurve], plain: dict[Unit, QualityCurve], below: float) -> str:

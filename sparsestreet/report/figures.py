@@ -31,13 +31,13 @@ from sparsestreet.report.variants import Unit, Value, Variant, by_scene, plain_o
 T = TypeVar("T")
 
 # Okabe and Ito's palette with a slightly lighter blue: distinguishable with any color vision, on white and on black.
-# The last four are for the seventh arm and on.
+# The last four are for the seventh variant and on.
 COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7a5195", "#8c564b", "#5c6f1c", "#b3003c")
 GREY = "#8c8c8c"
 _MARKERS = {"none": "o", "paper": "s", "paper_short": "s", "removal": "D", "masks": "^", "importance": "v"}
 _MARKERS |= {"random": "x", "opacity": "+"}
 _SPARE = "P^vX*<>phd8H"
-"""Markers of other arms, in turn."""
+"""Markers of other variants, in turn."""
 _DASHES = ("-", "--", ":", "-.")
 _INK = "#010203"
 """Stands for the color of the page's text."""
@@ -118,47 +118,47 @@ def _titled(svg: str, name: str, texts: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Style:
-    """How an arm is drawn. Two arms of a figure differ in it."""
+    """How a variant is drawn. Two variants of a figure differ in it."""
 
     kind: str
-    """What the arm is beside its method: its sparsification, or all that its name says where that is of several."""
+    """What the variant is beside its method: its sparsification, or all that its name says where that is of several."""
     method: str
-    """Color of the arm's method; grey for a control."""
+    """Color of the variant's method; grey for a control."""
     color: str
     """Color of its kind, for figures or panels of one method; grey for a control."""
     marker: str
     dashes: str
 
 
-def styles(arms: Sequence[Variant]) -> dict[str, Style]:
-    """Returns name of an arm -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
-    methods, kinds = list(dict.fromkeys(arm.plain_label for arm in arms)), _kinds(arms)
+def styles(variants: Sequence[Variant]) -> dict[str, Style]:
+    """Returns name of a variant -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
+    methods, kinds = list(dict.fromkeys(variant.plain_label for variant in variants)), _kinds(variants)
     every = list(dict.fromkeys(kinds.values()))
     known = {"none": 0, "paper": 1, "paper_short": 1, "removal": 2, "masks": 3, "importance": 4}
     colored = _in_turn(every, known, range(len(COLORS)))
     marked = _in_turn(every, _MARKERS, _SPARE)
     found = {}
-    for arm in arms:
-        kind = kinds[arm.name]
+    for variant in variants:
+        kind = kinds[variant.name]
         own = {"capped": ":", "random": "--", "opacity": "-."}.get(kind)
         dashes = own or _DASHES[every.index(kind) // len(COLORS) % len(_DASHES)]
-        if arm.control and not own:
+        if variant.control and not own:
             dashes = _DASHES[every.index(kind) % len(_DASHES)]
-        method = COLORS[methods.index(arm.plain_label) % len(COLORS)]
-        paints = (GREY, GREY) if arm.control else (method, COLORS[colored[kind]])
-        found[arm.name] = Style(_in_legend(arm, kind), *paints, marked[kind], dashes)
+        method = COLORS[methods.index(variant.plain_label) % len(COLORS)]
+        paints = (GREY, GREY) if variant.control else (method, COLORS[colored[kind]])
+        found[variant.name] = Style(_in_legend(variant, kind), *paints, marked[kind], dashes)
     return found
 
 
-def _kinds(arms: Sequence[Variant]) -> dict[str, str]:
-    """Returns name of an arm -> its sparsification, or all that its name says beside its method."""
-    of_method = Counter((arm.plain_label, arm.sparsify) for arm in arms)
+def _kinds(variants: Sequence[Variant]) -> dict[str, str]:
+    """Returns name of a variant -> its sparsification, or all that its name says beside its method."""
+    of_method = Counter((variant.plain_label, variant.sparsify) for variant in variants)
     several = {sparsify for (_, sparsify), number in of_method.items() if number > 1}
     return {
-        arm.name: (arm.name.removeprefix(arm.plain_label).strip(" +") or arm.sparsify)
-        if arm.sparsify in several
-        else arm.sparsify
-        for arm in arms
+        variant.name: (variant.name.removeprefix(variant.plain_label).strip(" +") or variant.sparsify)
+        if variant.sparsify in several
+        else variant.sparsify
+        for variant in variants
     }
 
 
@@ -173,10 +173,10 @@ def _in_turn(kinds: Sequence[str], known: Mapping[str, T], spare: Sequence[T]) -
     return found | {kind: left[index % len(left)] for index, kind in enumerate(others)}
 
 
-def _in_legend(arm: Variant, kind: str) -> str:
-    if arm.control:
+def _in_legend(variant: Variant, kind: str) -> str:
+    if variant.control:
         return f"control: {kind}"
-    return "plain" if kind == "none" else f"plain {kind}" if arm.sparsify == "none" else kind
+    return "plain" if kind == "none" else f"plain {kind}" if variant.sparsify == "none" else kind
 
 
 def short(value: float) -> str:
@@ -202,26 +202,28 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return best
 
 
-def pareto(arms: Sequence[Variant], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
+def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
     """Draws quality of the full image, people and vehicles against one cost. Returns whether there was any to draw.
 
-    Every run is a small mark, every arm's mean a large one, with an arrow from plain to pruned. The front is that of
-    the means; controls are gray and in no front.
+    Every run is a small mark, every variant's mean a large one, with an arrow from plain to pruned. The front is that
+    of the means; controls are gray and in no front.
     """
     wanted = {"full image": protocol.psnr, "people": protocol.human[0], "vehicles": protocol.vehicle[0]}
     regions = {name: _held_out(metric) for name, metric in wanted.items()}
-    regions = {name: value for name, value in regions.items() if any(arm.mean(value) is not None for arm in arms)}
-    if not regions or all(arm.mean(cost[2]) is None for arm in arms):
+    regions = {
+        name: value for name, value in regions.items() if any(variant.mean(value) is not None for variant in variants)
+    }
+    if not regions or all(variant.mean(cost[2]) is None for variant in variants):
         return False
     figure, axes = panels(len(regions))
     says: Says = {}
     for index, (one, (name, value)) in enumerate(zip(axes, regions.items(), strict=True)):
-        says |= _pareto_panel(one, arms, cost, value, name)
+        says |= _pareto_panel(one, variants, cost, value, name)
         one.set_title(name, fontsize=10)
         one.set_xlabel(cost[1])
         if index == 0:
             one.set_ylabel("held-out PSNR, dB")
-    legend_below(figure, _legend(arms))
+    legend_below(figure, _legend(variants))
     write_svg(figure, path, says)
     return True
 
@@ -230,32 +232,40 @@ def _held_out(metric: str) -> Value:
     return lambda run: run.mean(metric, HELD_OUT)
 
 
-def _pareto_panel(axes: Axes, arms: Sequence[Variant], of: tuple[str, str, Value], quality: Value, region: str) -> Says:
-    style = styles(arms)
+def _pareto_panel(
+    axes: Axes, variants: Sequence[Variant], of: tuple[str, str, Value], quality: Value, region: str
+) -> Says:
+    style = styles(variants)
     cost, unit = of[2], of[1]
     means: dict[str, tuple[float, float]] = {}
     says: Says = {}
-    for number, arm in enumerate(arms):
-        paint, marker = _paint(style, arm), style[arm.name].marker
-        points = _points(arm, cost, quality)
+    for number, variant in enumerate(variants):
+        paint, marker = _paint(style, variant), style[variant.name].marker
+        points = _points(variant, cost, quality)
         if not points:
             continue
         axes.scatter(*zip(*points.values(), strict=True), s=9, alpha=0.45, color=paint, marker=marker,
                      linewidths=0.8, gid=(runs := f"{region} {number} runs"))  # fmt: skip
-        means[arm.name] = _mean_point(points)
-        says[runs] = [f"{arm.name}, {scene}, seed {seed}: {_in_words(point, unit)}"
+        means[variant.name] = _mean_point(points)
+        says[runs] = [f"{variant.name}, {scene}, seed {seed}: {_in_words(point, unit)}"
                       for ((scene, _), seed), point in points.items()]  # fmt: skip
-        says[f"{region} {number} mean"] = [f"{arm.title}, mean: {_in_words(means[arm.name], unit)}"]
+        says[f"{region} {number} mean"] = [f"{variant.title}, mean: {_in_words(means[variant.name], unit)}"]
         # A marker of lines has no inside to leave empty: it is drawn thin.
         hollow = {"facecolors": "none", "edgecolors": paint} if marker not in "x+" else {"color": paint}
-        shape = {**hollow, "linewidths": 0.8} if arm.lacks else {"color": paint, "linewidths": 1.6}
-        axes.scatter(*means[arm.name], s=48, marker=marker, zorder=3, gid=f"{region} {number} mean", **shape)
-    for arm in arms:
-        ends = None if arm.control else paired_means(arm, plain_of(arm, arms), cost, quality)
+        shape = {**hollow, "linewidths": 0.8} if variant.lacks else {"color": paint, "linewidths": 1.6}
+        axes.scatter(*means[variant.name], s=48, marker=marker, zorder=3, gid=f"{region} {number} mean", **shape)
+    for variant in variants:
+        ends = None if variant.control else paired_means(variant, plain_of(variant, variants), cost, quality)
         if ends is not None:
-            arrow = {"arrowstyle": "->", "color": _paint(style, arm), "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
+            arrow = {"arrowstyle": "->", "color": _paint(style, variant), "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
             axes.annotate("", ends[1], ends[0], arrowprops=arrow)
-    best = front([means[arm.name] for arm in arms if arm.name in means and not arm.control and not arm.lacks])
+    best = front(
+        [
+            means[variant.name]
+            for variant in variants
+            if variant.name in means and not variant.control and not variant.lacks
+        ]
+    )
     if best:
         axes.plot(*zip(*best, strict=True), color=_INK, linewidth=0.9, linestyle="--", zorder=1)
     axes.set_xscale("log")
@@ -266,9 +276,9 @@ def _pareto_panel(axes: Axes, arms: Sequence[Variant], of: tuple[str, str, Value
     return says
 
 
-def _paint(style: Mapping[str, Style], arm: Variant) -> str:
+def _paint(style: Mapping[str, Style], variant: Variant) -> str:
     """Returns the color of the method, or of the kind if there is one method."""
-    own = style[arm.name]
+    own = style[variant.name]
     return own.color if len({one.method for one in style.values()} - {GREY}) <= 1 else own.method
 
 
@@ -287,15 +297,15 @@ def _in_words(point: tuple[float, float], unit: str) -> str:
 
 
 def paired_means(
-    arm: Variant, plain: Variant | None, cost: Value, quality: Value
+    variant: Variant, plain: Variant | None, cost: Value, quality: Value
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Returns where an arrow starts and ends: the means of the plain arm and of an arm over the units of both.
+    """Returns where an arrow starts and ends: the means of the plain variant and of a variant over the units of both.
 
-    None for the plain arm itself, without one, and without a common unit.
+    None for the plain variant itself, without one, and without a common unit.
     """
-    if plain is None or plain is arm:
+    if plain is None or plain is variant:
         return None
-    ours, theirs = _points(arm, cost, quality), _points(plain, cost, quality)
+    ours, theirs = _points(variant, cost, quality), _points(plain, cost, quality)
     shared = ours.keys() & theirs.keys()
     if not shared:
         return None
@@ -303,9 +313,9 @@ def paired_means(
     return start, end
 
 
-def _points(arm: Variant, cost: Value, quality: Value) -> dict[Unit, tuple[float, float]]:
+def _points(variant: Variant, cost: Value, quality: Value) -> dict[Unit, tuple[float, float]]:
     """Returns scene and seed -> cost and quality, where both are known."""
-    costs, qualities = arm.units(cost), arm.units(quality)
+    costs, qualities = variant.units(cost), variant.units(quality)
     return {unit: (costs[unit], qualities[unit]) for unit in sorted(costs.keys() & qualities.keys())}
 
 
@@ -316,49 +326,51 @@ def _mean_point(points: Mapping[Unit, tuple[float, float]]) -> tuple[float, floa
     return x, y
 
 
-def _legend(arms: Sequence[Variant]) -> list[Line2D]:
-    style = styles(arms)
-    methods = {arm.plain_label: style[arm.name].method for arm in arms if not arm.control}
+def _legend(variants: Sequence[Variant]) -> list[Line2D]:
+    style = styles(variants)
+    methods = {variant.plain_label: style[variant.name].method for variant in variants if not variant.control}
     dots = [Line2D([], [], color=paint, marker="o", linestyle="", label=name) for name, paint in methods.items()]
     # Of one method, the color is the kind's.
     dots, alone = (dots, False) if len(methods) > 1 else ([], True)
-    kinds = {style[arm.name].kind: arm for arm in arms}
+    kinds = {style[variant.name].kind: variant for variant in variants}
     shapes = [
         Line2D(
             [],
             [],
-            color=GREY if arm.control else style[arm.name].color if alone else _INK,
-            marker=style[arm.name].marker,
+            color=GREY if variant.control else style[variant.name].color if alone else _INK,
+            marker=style[variant.name].marker,
             linestyle="",
             markerfacecolor="none",
             label=kind,
         )
-        for kind, arm in kinds.items()
+        for kind, variant in kinds.items()
     ]
     return [*dots, *shapes, Line2D([], [], color=_INK, linestyle="--", linewidth=0.9, label="front of the means")]
 
 
-_MOST_BESIDE_CURVES = 6
+_MAX_NAMES_IN_PANEL = 6
 """Largest number of names in a legend that stands within a panel."""
 
 
-def held_out_over_time(arms: Sequence[Variant], path: Path) -> bool:
+def held_out_over_time(variants: Sequence[Variant], path: Path) -> bool:
     """Draws held-out PSNR over training seconds, a panel a method, a line a run. Returns whether a run has a curve."""
-    found = {arm.name: [curve for some in curves_of_runs(arm).values() for curve in some] for arm in arms}
-    drawn = [arm for arm in arms if found[arm.name]]
+    found = {
+        variant.name: [curve for some in curves_of_runs(variant).values() for curve in some] for variant in variants
+    }
+    drawn = [variant for variant in variants if found[variant.name]]
     if not drawn:
         return False
-    methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
+    methods = list(dict.fromkeys(variant.plain_label for variant in drawn))
     figure, axes = panels(len(methods))
     says: Says = {}
-    look = styles(arms)
+    look = styles(variants)
     for one, method in zip(axes, methods, strict=True):
-        for arm in _of(drawn, method):
-            for curve in found[arm.name]:
+        for variant in _of(drawn, method):
+            for curve in found[variant.name]:
                 name = f"curve {len(says)}"
-                one.plot(curve.seconds, curve.psnr, **_line(look[arm.name]), marker=".", markersize=3, gid=name)
+                one.plot(curve.seconds, curve.psnr, **_line(look[variant.name]), marker=".", markersize=3, gid=name)
                 looks = zip(curve.seconds, curve.psnr, strict=True)
-                says[name] = [f"{arm.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
+                says[name] = [f"{variant.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
         _finish(one, method, "training seconds")
     axes[0].set_ylabel("held-out PSNR, dB")
     _legends(figure, axes)
@@ -366,19 +378,19 @@ def held_out_over_time(arms: Sequence[Variant], path: Path) -> bool:
     return True
 
 
-def counts_over_time(arms: Sequence[Variant], path: Path) -> bool:
+def counts_over_time(variants: Sequence[Variant], path: Path) -> bool:
     """Draws the number of Gaussians over steps, a panel a method, a line a run; dots mark masks and pruning passes."""
-    drawn = [arm for arm in arms if any(LEDGER.exists(record.folder) for record in arm.records)]
+    drawn = [variant for variant in variants if any(LEDGER.exists(record.folder) for record in variant.records)]
     if not drawn:
         return False
-    methods = list(dict.fromkeys(arm.plain_label for arm in drawn))
+    methods = list(dict.fromkeys(variant.plain_label for variant in drawn))
     figure, axes = panels(len(methods))
-    look = styles(arms)
+    look = styles(variants)
     for one, method in zip(axes, methods, strict=True):
-        for arm in _of(drawn, method):
-            for record in arm.records:
+        for variant in _of(drawn, method):
+            for record in variant.records:
                 if LEDGER.exists(record.folder):
-                    _counts(one, look[arm.name], record.folder)
+                    _counts(one, look[variant.name], record.folder)
         one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
         _finish(one, method, "step")
     axes[0].set_ylabel("Gaussians")
@@ -397,19 +409,19 @@ def _counts(axes: Axes, look: Style, folder: Path) -> None:
     axes.plot(taken, [at[step] for step in taken], ".", markersize=4, color=look.color, label="_")
 
 
-def frame_waterfall(arms: Sequence[Variant], path: Path) -> bool:
-    """Draws the additional time of a frame with each node and effect, a bar an arm. Returns whether a run has it."""
-    costs = {arm.name: _frame_costs(arm) for arm in arms}
-    drawn = [arm for arm in arms if costs[arm.name]]
+def frame_waterfall(variants: Sequence[Variant], path: Path) -> bool:
+    """Draws the additional time of a frame with each node and effect, a bar a variant. Returns whether a run has it."""
+    costs = {variant.name: _frame_costs(variant) for variant in variants}
+    drawn = [variant for variant in variants if costs[variant.name]]
     if not drawn:
         return False
-    parts = list(dict.fromkeys(part for arm in drawn for part in costs[arm.name]))
-    titles = [textwrap.wrap(arm.title, 40) for arm in drawn]
+    parts = list(dict.fromkeys(part for variant in drawn for part in costs[variant.name]))
+    titles = [textwrap.wrap(variant.title, 40) for variant in drawn]
     # A bar is as high as the most lines of a name, which would run into its neighbors'.
     figure, (axes,) = panels(1, width=7.4, height=1.1 + max(0.34, 0.16 * max(map(len, titles)) + 0.08) * len(drawn))
-    for row, arm in enumerate(drawn):
+    for row, variant in enumerate(drawn):
         left = 0.0
-        for part, ms in costs[arm.name].items():
+        for part, ms in costs[variant.name].items():
             index = parts.index(part)
             hatch = "//" if part.startswith("effect") else None
             axes.barh(row, ms, left=left, height=0.62, color=COLORS[index % len(COLORS)], hatch=hatch,
@@ -427,18 +439,18 @@ def frame_waterfall(arms: Sequence[Variant], path: Path) -> bool:
     return True
 
 
-def _frame_costs(arm: Variant) -> dict[str, float]:
+def _frame_costs(variant: Variant) -> dict[str, float]:
     """Returns node or effect -> mean milliseconds over the runs that recorded it."""
     found: dict[str, list[float]] = {}
-    for costs in filter(None, (COSTS.find(record.folder) for record in arm.records)):
+    for costs in filter(None, (COSTS.find(record.folder) for record in variant.records)):
         parts = {name: node.ms for name, node in costs.nodes.items()}
         for part, ms in (parts | {f"effect: {name}": ms for name, ms in costs.effects.items()}).items():
             found.setdefault(part, []).append(ms)
     return {part: statistics.fmean(values) for part, values in found.items()}
 
 
-def _of(arms: Sequence[Variant], method: str) -> list[Variant]:
-    return [arm for arm in arms if arm.plain_label == method]
+def _of(variants: Sequence[Variant], method: str) -> list[Variant]:
+    return [variant for variant in variants if variant.plain_label == method]
 
 
 def _line(look: Style) -> dict[str, Any]:
@@ -453,7 +465,7 @@ def _finish(axes: Axes, title: str, x_label: str) -> None:
 def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
     """Adds a legend to each panel, or one below all of them if it would hide the curves."""
     named = [dict(zip(*reversed(one.get_legend_handles_labels()), strict=True)) for one in axes]
-    if max(map(len, named)) <= _MOST_BESIDE_CURVES:
+    if max(map(len, named)) <= _MAX_NAMES_IN_PANEL:
         for one, once in zip(axes, named, strict=True):
             one.legend(once.values(), once.keys(), **LEGEND)
         return
@@ -464,19 +476,19 @@ def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
 _DASHES_FIGURES_README = {"plain": "-", "paper": "--", "paper_short": "--", "removal": ":"}
 
 
-def time_figure(arms: Sequence[Variant], protocol: Protocol, path: Path) -> None:
+def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> None:
     """Writes a PNG: held-out PSNR over training seconds and over milliseconds a frame, without controls.
 
     Curves are means over scenes and seeds at each look. Without curves, only the end of training is drawn. Raises
     ValueError if no run has a held-out PSNR.
     """
-    shown = [arm for arm in arms if not arm.control and arm.mean(_psnr(protocol)) is not None]
+    shown = [variant for variant in variants if not variant.control and variant.mean(_psnr(protocol)) is not None]
     if not shown:
         raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
     figure, (training, frame) = panels(2, width=4.6, height=4.0)
-    for arm in shown:
-        _over_training(training, arm, shown, protocol)
-        _points_figures_readme(frame, arm, shown, lambda run: run.latency.p50, protocol)
+    for variant in shown:
+        _over_training(training, variant, shown, protocol)
+        _points_figures_readme(frame, variant, shown, lambda run: run.latency.p50, protocol)
     training.set_xlabel("training seconds")
     frame.set_xlabel("milliseconds a frame")
     training.set_ylabel("held-out PSNR, dB")
@@ -490,42 +502,46 @@ def _psnr(protocol: Protocol) -> Value:
     return lambda run: run.mean(protocol.psnr, HELD_OUT)
 
 
-def _over_training(axes: Axes, arm: Variant, shown: Sequence[Variant], protocol: Protocol) -> None:
-    curves = list(curves_of(arm).values())
+def _over_training(axes: Axes, variant: Variant, shown: Sequence[Variant], protocol: Protocol) -> None:
+    curves = list(curves_of(variant).values())
     if not curves:
-        _points_figures_readme(axes, arm, shown, _seconds, protocol)
+        _points_figures_readme(axes, variant, shown, _seconds, protocol)
         return
     mean = mean_curve(curves)
-    look, end = styles(shown)[arm.name], [len(mean.seconds) - 1]
+    look, end = styles(shown)[variant.name], [len(mean.seconds) - 1]
     dashes = _DASHES_FIGURES_README.get(look.kind, "-.")
-    paint = _paint_figures_readme(arm, shown)
+    paint = _paint_figures_readme(variant, shown)
     axes.plot(
-        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(arm)
+        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(variant)
     )
 
 
-def _paint_figures_readme(arm: Variant, shown: Sequence[Variant]) -> str:
-    """Returns the color of the arm's method, or of its sparsification if there is only one method."""
+def _paint_figures_readme(variant: Variant, shown: Sequence[Variant]) -> str:
+    """Returns the color of the variant's method, or of its sparsification if there is only one method."""
     look = styles(shown)
-    own = look[arm.name]
+    own = look[variant.name]
     return own.method if len({one.method for one in look.values()}) > 1 else own.color
 
 
-def _points_figures_readme(axes: Axes, arm: Variant, shown: Sequence[Variant], cost: Value, protocol: Protocol) -> None:
+def _points_figures_readme(
+    axes: Axes, variant: Variant, shown: Sequence[Variant], cost: Value, protocol: Protocol
+) -> None:
     """Draws the mean, and every run small and pale."""
-    costs, qualities = arm.units(cost), arm.units(_psnr(protocol))
+    costs, qualities = variant.units(cost), variant.units(_psnr(protocol))
     units = sorted(costs.keys() & qualities.keys())
     if not units:
         return
-    paint = _paint_figures_readme(arm, shown)
+    paint = _paint_figures_readme(variant, shown)
     axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
     scenes = (by_scene({unit: values[unit] for unit in units}) for values in (costs, qualities))
     x, y = (statistics.fmean(means.values()) for means in scenes)
-    axes.scatter(x, y, s=44, color=paint, marker=styles(shown)[arm.name].marker, label=_label(arm), zorder=3)
+    axes.scatter(x, y, s=44, color=paint, marker=styles(shown)[variant.name].marker, label=_label(variant), zorder=3)
 
 
-def _label(arm: Variant) -> str:
-    return f"{arm.title} (machine not quiet)" if arm.busy("frames") or arm.busy("training") else arm.title
+def _label(variant: Variant) -> str:
+    return (
+        f"{variant.title} (machine not quiet)" if variant.busy("frames") or variant.busy("training") else variant.title
+    )
 
 
 def _seconds(run: RunSummary) -> float | None:

@@ -35,8 +35,8 @@ def shifts_of(run: Path) -> dict[float, dict[str, float]]:
     return {meters: {name: statistics.fmean(some) for name, some in found.items()} for meters, found in sides.items()}
 
 
-def mean_beside(arm: Variant, meters: float, name: str) -> float | None:
-    """Returns the mean of an arm in which each scene counts once; None if no run has the number.
+def mean_beside(variant: Variant, meters: float, name: str) -> float | None:
+    """Returns the mean of a variant in which each scene counts once; None if no run has the number.
 
     Runs that were trained on all views count only if no run that holds views out has the number.
     """
@@ -44,23 +44,23 @@ def mean_beside(arm: Variant, meters: float, name: str) -> float | None:
     def value(record: RunRecord) -> float | None:
         return shifts_of(record.folder).get(meters, {}).get(name)
 
-    return mean_over_scenes(arm.units_of_records(value) or arm.units_of_records(value, whole=True))
+    return mean_over_scenes(variant.units_of_records(value) or variant.units_of_records(value, whole=True))
 
 
-def beside_the_path(arms: Sequence[Variant]) -> Grid | None:
+def beside_the_path(variants: Sequence[Variant]) -> Grid | None:
     """Returns PSNR and LPIPS to the truth and every recorded distance, by meters; None if no run recorded any."""
-    measured = [shifts_of(record.folder) for arm in arms for record in arm.records]
+    measured = [shifts_of(record.folder) for variant in variants for record in variant.records]
     found = {(name, meters) for shifts in measured for meters, numbers in shifts.items() for name in numbers}
     columns = sorted(found, key=lambda column: (column[0] not in _PLACES, _PLACES.get(column[0], 0), column))
     if not columns:
         return None
     rows = []
-    for arm in arms:
-        runs = tuple(record.folder.name for record in arm.records)
-        means = [mean_beside(arm, meters, name) for name, meters in columns]
+    for variant in variants:
+        runs = tuple(record.folder.name for record in variant.records)
+        means = [mean_beside(variant, meters, name) for name, meters in columns]
         texts = [None if mean is None else _text(name, mean) for (name, _), mean in zip(columns, means, strict=True)]
         cells = [Cell() if text is None else Cell(text, runs=runs) for text in texts]
-        rows.append((Cell(arm.title, runs=runs), *cells))
+        rows.append((Cell(variant.title, runs=runs), *cells))
     header = (("", "arm"), *((name, f"{meters:g} m") for name, meters in columns))
     notes = (
         "mean of both sides; a distance of image sets is biased by their number, so that it compares arms of one sweep "
@@ -85,14 +85,16 @@ _COSTS: tuple[tuple[str, str, str, Number], ...] = (
 )
 
 
-def rendered_otherwise(arms: Sequence[Variant], protocol: Protocol) -> Grid | None:
-    """Returns a row for each arm and preset that its runs have; None if no run has any.
+def rendered_otherwise(variants: Sequence[Variant], protocol: Protocol) -> Grid | None:
+    """Returns a row for each variant and preset that its runs have; None if no run has any.
 
     Raises RecordError for a malformed record.
     """
-    recorded = [(arm, _records(arm)) for arm in arms]
-    labels = Counter(arm.label for arm in arms)
-    rows = [row for arm, records in recorded for row in _rows(arm, records, protocol, labels[arm.label] > 1)]
+    recorded = [(variant, _records(variant)) for variant in variants]
+    labels = Counter(variant.label for variant in variants)
+    rows = [
+        row for variant, records in recorded for row in _rows(variant, records, protocol, labels[variant.label] > 1)
+    ]
     if not rows:
         return None
     header = [("", "trained"), ("", "rendered"), ("", "n")]
@@ -102,14 +104,14 @@ def rendered_otherwise(arms: Sequence[Variant], protocol: Protocol) -> Grid | No
         "one scene, the same held-out views; dB to exact: of the image against that of the same scene without cut-off "
         "and early stop; differences paired by scene and seed, with 95 % t intervals, bold where they exclude 0"
     ]
-    if busy := [arm.name for arm, records in recorded if _busy(records)]:
+    if busy := [variant.name for variant, records in recorded if _busy(records)]:
         notes.append(f"{BUSY} times of a machine that was not quiet, compared with no other: {', '.join(busy)}")
     return Grid("presets", "Trained one way, rendered another", tuple(header), tuple(rows), tuple(notes))
 
 
-def _records(arm: Variant) -> Records:
+def _records(variant: Variant) -> Records:
     """Returns the records of the runs that hold views out; if there are none, those of runs trained on all views."""
-    return _found(arm.runs()) or _found(arm.runs(whole=True))
+    return _found(variant.runs()) or _found(variant.runs(whole=True))
 
 
 def _found(runs: dict[Unit, list[RunRecord]]) -> Records:
@@ -125,13 +127,13 @@ def _rendered(records: Records, wanted: Callable[[RenderedAs], bool]) -> Rendere
     return {unit: some for unit, some in kept.items() if some}
 
 
-def _rows(arm: Variant, records: Records, protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:
-    """``several``: whether several arms have this label. If so, the preset of training, if known, tells them apart."""
-    runs = tuple(run.folder.name for run in arm.records)
+def _rows(variant: Variant, records: Records, protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:
+    """Yield a row for each preset; the preset of training tells ``several`` variants of a label apart."""
+    runs = tuple(run.folder.name for run in variant.records)
     metrics = (protocol.psnr, protocol.human[0], protocol.vehicle[0])
     trained = _rendered(records, lambda one: one.trained)
     presets = {one.preset for some in trained.values() for one in some}
-    title = f"{arm.label}, {presets.pop()}" if several and len(presets) == 1 else arm.title
+    title = f"{variant.label}, {presets.pop()}" if several and len(presets) == 1 else variant.title
     every = [one for some in _rendered(records, lambda one: True).values() for one in some]
     for preset in dict.fromkeys(one.preset for one in every):
         found = _rendered(records, lambda one, preset=preset: one.preset == preset)

@@ -20,7 +20,7 @@ from sparsestreet.report.variants import Variant
 
 _THEIRS = ", paper"
 """The end of a heading whose column has published numbers."""
-_MANY = 14
+_MAX_FULL_SIZE_COLUMNS = 14
 """Columns from which on a table is printed smaller."""
 _HERE = Path(__file__).parent
 _NOTHING_FROM_OUTSIDE = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -112,7 +112,7 @@ def _grid(grid: Grid, sets: Mapping[tuple[str, ...], str]) -> str:
         for _, heading in grid.header
     )
     rows = "\n".join("<tr>" + "".join(_cell(cell, sets) for cell in row) + "</tr>" for row in grid.rows)
-    wide = "wide many" if len(grid.header) > _MANY else "wide"
+    wide = "wide many" if len(grid.header) > _MAX_FULL_SIZE_COLUMNS else "wide"
     return (
         f"<section id='{grid.name}'><h2>{escape(grid.title)}</h2>\n<div class='{wide}' tabindex='0'><table><thead>"
         f"{above}<tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>\n{_notes(grid.notes)}</section>"
@@ -240,30 +240,30 @@ VIEWS = 2
 """Number of views of each scene."""
 
 
-def comparison_data(arms: Sequence[Variant]) -> str | None:
+def comparison_data(variants: Sequence[Variant]) -> str | None:
     """Returns JSON of the views with their images as data URLs, truth first; None if there is no view to compare.
 
-    Each scene shows one seed, which most of the arms have (the lowest of several), and the first ``VIEWS`` views that
-    evaluation drew.
+    Each scene shows one seed, which most of the variants have (the lowest of several), and the first ``VIEWS`` views
+    that evaluation drew.
     """
     views = []
-    scenes = sorted({record.summary.run.scene for arm in arms for record in arm.records})
+    scenes = sorted({record.summary.run.scene for variant in variants for record in variant.records})
     for scene in scenes:
-        seed = _seed_of_most(arms, scene)
-        shown = [(arm, record) for arm in arms if (record := _record(arm, scene, seed)) is not None]
+        seed = _seed_of_most(variants, scene)
+        shown = [(variant, record) for variant in variants if (record := _record(variant, scene, seed)) is not None]
         keys = drawn_views(shown[0][1].folder / "pictures")[:VIEWS] if shown else []
         views += [view for key in keys if (view := _view(scene, seed, key, shown)) is not None]
     # A tag inside the text would end the script element.
     return json.dumps(views).replace("</", "<\\/") if views else None
 
 
-def _seed_of_most(arms: Sequence[Variant], scene: str) -> int:
-    seeds = sorted({record.summary.run.seed for arm in arms for record in arm.records})
-    return max(seeds, key=lambda seed: sum(_record(arm, scene, seed) is not None for arm in arms))
+def _seed_of_most(variants: Sequence[Variant], scene: str) -> int:
+    seeds = sorted({record.summary.run.seed for variant in variants for record in variant.records})
+    return max(seeds, key=lambda seed: sum(_record(variant, scene, seed) is not None for variant in variants))
 
 
-def _record(arm: Variant, scene: str, seed: int) -> RunRecord | None:
-    for record in arm.records:
+def _record(variant: Variant, scene: str, seed: int) -> RunRecord | None:
+    for record in variant.records:
         run = record.summary.run
         if (run.scene, run.seed) == (scene, seed) and run.split != "none":
             return record
@@ -273,15 +273,17 @@ def _record(arm: Variant, scene: str, seed: int) -> RunRecord | None:
 def _view(
     scene: str, seed: int, key: tuple[int, int], shown: Sequence[tuple[Variant, RunRecord]]
 ) -> dict[str, object] | None:
-    pictures = [(arm, record, picture_path(record.folder / "pictures", *key, "render")) for arm, record in shown]
-    pictures = [(arm, record, path) for arm, record, path in pictures if path.is_file()]
+    pictures = [
+        (variant, record, picture_path(record.folder / "pictures", *key, "render")) for variant, record in shown
+    ]
+    pictures = [(variant, record, path) for variant, record, path in pictures if path.is_file()]
     truth = picture_path(pictures[0][1].folder / "pictures", *key, "truth") if pictures else None
     if truth is None or not truth.is_file():
         return None
     images = [{"name": "truth", "label": "truth", "data": _embedded(truth)}]
-    for arm, record, path in pictures:
-        label = f"{arm.title}, {_psnr(record, key)}{record.summary.gaussians_total:,} Gaussians"
-        images.append({"name": arm.title, "label": label, "data": _embedded(path)})
+    for variant, record, path in pictures:
+        label = f"{variant.title}, {_psnr(record, key)}{record.summary.gaussians_total:,} Gaussians"
+        images.append({"name": variant.title, "label": label, "data": _embedded(path)})
     return {"name": f"{scene}, seed {seed}, frame {key[0]}, camera {key[1]}", "images": images}
 
 

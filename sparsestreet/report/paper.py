@@ -21,7 +21,7 @@ Key = tuple[str, str, str]
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A row as printed, and the arm of ours that it is compared with."""
+    """A row as printed, and the variant of ours that it is compared with."""
 
     name: str
     method: str | None
@@ -29,7 +29,7 @@ class PublishedRow:
     sparsify: str
     values: tuple[float | None, ...]
     options: tuple[str, ...] = ()
-    """Words of an arm's name that distinguish it from others with this method and sparsification."""
+    """Words of a variant's name that distinguish it from others with this method and sparsification."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ _SHIFTED = tuple(("novel", f"{meters} m", "fid") for meters in (1, 2, 3))
 
 
 def _rows(text: str) -> tuple[PublishedRow, ...]:
-    """Parses lines: name | method | sparsification and words of the arm's name | numbers as printed, in order."""
+    """Parses lines: name | method | sparsification and words of the variant's name | numbers as printed, in order."""
     return tuple(_row_published(*(part.strip() for part in line.split("|"))) for line in text.strip().splitlines())
 
 
@@ -164,20 +164,20 @@ _TEXTS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "fid": "{:.2f}"
 
 
 def paper_table(
-    arms: Sequence[Variant], failures: Sequence[tuple[Path, FailedRun]], protocol: Protocol, sweep: str | None
+    variants: Sequence[Variant], failures: Sequence[tuple[Path, FailedRun]], protocol: Protocol, sweep: str | None
 ) -> Grid:
-    """Returns the paper's table that a sweep reproduces; for any other sweep, its arms in the layout of Table 1."""
+    """Returns the paper's table that a sweep reproduces; for any other sweep, its variants in the layout of Table 1."""
     table = TABLES.get(sweep or "", LAYOUT)
-    left = list(arms)
+    left = list(variants)
     rows = []
     for row in table.rows:
-        matching = [arm for arm in left if _stands_beside(arm, row)]
-        left = [arm for arm in left if arm not in matching]
+        matching = [variant for variant in left if _stands_beside(variant, row)]
+        left = [variant for variant in left if variant not in matching]
         if matching:
-            rows += [_row(arm.title, arm, table, row, protocol) for arm in matching]
+            rows += [_row(variant.title, variant, table, row, protocol) for variant in matching]
         elif sweep in TABLES:
             rows.append(_row(f"{row.name} (not run)", None, table, row, protocol))
-    rows += [_row(arm.title, arm, table, None, protocol) for arm in left]
+    rows += [_row(variant.title, variant, table, None, protocol) for variant in left]
     rows += [
         _failed(folder, failure, len(rows[0]) if rows else 2 + 2 * len(table.columns)) for folder, failure in failures
     ]
@@ -198,13 +198,13 @@ def paper_table(
         f"{of}: {table.caption}" if sweep in TABLES else of,
         tuple(header),
         tuple(rows),
-        _notes(arms, table, protocol, sweep in TABLES, beside, bool(failures)),
+        _notes(variants, table, protocol, sweep in TABLES, beside, bool(failures)),
     )
 
 
-def _stands_beside(arm: Variant, row: PublishedRow) -> bool:
-    told = all(word in arm.name for word in row.options)
-    return arm.method == row.method and arm.sparsify == row.sparsify and told
+def _stands_beside(variant: Variant, row: PublishedRow) -> bool:
+    told = all(word in variant.name for word in row.options)
+    return variant.method == row.method and variant.sparsify == row.sparsify and told
 
 
 def _heading(key: Key) -> str:
@@ -214,33 +214,33 @@ def _heading(key: Key) -> str:
 
 
 def _row(
-    title: str, arm: Variant | None, table: PublishedTable, row: PublishedRow | None, protocol: Protocol
+    title: str, variant: Variant | None, table: PublishedTable, row: PublishedRow | None, protocol: Protocol
 ) -> tuple[Cell, ...]:
     published = table.values(row) if row else {}
-    runs = tuple(record.folder.name for record in arm.records) if arm else ()
-    cells = [Cell(title, runs=runs), Cell(str(len(runs)) if arm else ABSENT, runs=runs)]
+    runs = tuple(record.folder.name for record in variant.records) if variant else ()
+    cells = [Cell(title, runs=runs), Cell(str(len(runs)) if variant else ABSENT, runs=runs)]
     for key in table.columns:
-        ours = _ours(arm, key, protocol) if arm else None
+        ours = _ours(variant, key, protocol) if variant else None
         theirs = published.get(key)
         exact = "" if ours is None else f"{ours:.8g}"
-        busy = f" {arm.busy('frames')}".rstrip() if arm and key[2] == "fps" else ""
+        busy = f" {variant.busy('frames')}".rstrip() if variant and key[2] == "fps" else ""
         cells += [Cell(_text(ours, key) + busy, runs=runs, exact=exact), Cell(_text(theirs, key), published=True)]
     return tuple(cells)
 
 
-def _ours(arm: Variant, key: Key, protocol: Protocol) -> float | None:
+def _ours(variant: Variant, key: Key, protocol: Protocol) -> float | None:
     views = key[0]
     if views == "novel":
-        return mean_beside(arm, float(key[1].split()[0]), key[2])
+        return mean_beside(variant, float(key[1].split()[0]), key[2])
     value = _value(key, protocol)
     if value is None:
         return None
     if views == TRAINING:
         # As in DriveStudio, prefer runs that were trained on all views.
-        whole = arm.mean(value, whole=True)
-        return arm.mean(value) if whole is None else whole
-    mean = arm.mean(value)
-    return arm.mean(value, whole=True) if mean is None and views == "" else mean
+        whole = variant.mean(value, whole=True)
+        return variant.mean(value) if whole is None else whole
+    mean = variant.mean(value)
+    return variant.mean(value, whole=True) if mean is None and views == "" else mean
 
 
 def _value(key: Key, protocol: Protocol) -> Value | None:
@@ -279,7 +279,7 @@ def _failed(folder: Path, failure: FailedRun, width: int) -> tuple[Cell, ...]:
 
 
 def _notes(
-    arms: Sequence[Variant], table: PublishedTable, protocol: Protocol, same: bool, beside: bool, failed: bool
+    variants: Sequence[Variant], table: PublishedTable, protocol: Protocol, same: bool, beside: bool, failed: bool
 ) -> tuple[str, ...]:
     published = [
         f"paper: published in Table {table.number}, of another implementation, clock and machine, "
@@ -292,12 +292,12 @@ def _notes(
         "n: runs; a number is the mean over scenes of the mean over each one's seeds; "
         "FPS is 1000 / median milliseconds of a frame",
     ]
-    if not any(record.summary.run.split == "none" for arm in arms for record in arm.records):
+    if not any(record.summary.run.split == "none" for variant in variants for record in variant.records):
         said.append(
             "reconstruction: of the training views of the runs that hold views out; no run trained on all views"
         )
-    controls = sorted({(arm.sparsify, arm.control) for arm in arms if arm.control})
+    controls = sorted({(variant.sparsify, variant.control) for variant in variants if variant.control})
     said += [f"control {name}: {control}" for name, control in controls]
     if failed:
         said.append("failed runs are in no mean")
-    return (*said, *busy_variants(arms))
+    return (*said, *busy_variants(variants))

@@ -332,7 +332,7 @@ def _capped(variant: Repeats) -> bool:
 
 ABSENT = "-"
 
-_MOST_COLUMNS = 5
+_MAX_COLUMNS = 5
 """Largest number of variants and differences that stand in columns; more become rows if the terminal is wide enough."""
 
 
@@ -380,7 +380,7 @@ def size_figure(records: Sequence[RunRecord], path: Path) -> None:
 
 def _drawn(section: Section, width: int) -> list[Table | Text]:
     lines = _lines(section)
-    if len(section.rows) > _MOST_COLUMNS and sum(map(_room, zip(*lines, strict=True))) < width:
+    if len(section.rows) > _MAX_COLUMNS and sum(map(_room, zip(*lines, strict=True))) < width:
         blocks = [lines]
     else:
         labels, *columns = lines

@@ -152,8 +152,8 @@ def _effects_alike(found: Sequence[Variant]) -> list[str]:
 
 
 def _baseline(found: Sequence[Variant]) -> list[str]:
-    """Says why there are no differences: no arm is the plain one of another."""
-    if len(found) < 2 or any(plain_of(arm, found) not in (None, arm) for arm in found):
+    """Says why there are no differences: no variant is the plain one of another."""
+    if len(found) < 2 or any(plain_of(variant, found) not in (None, variant) for variant in found):
         return []
     return [
         "no arm is a baseline, so no table of differences and no arrows: add sparsify=none to the sweep, or compare "
@@ -162,7 +162,7 @@ def _baseline(found: Sequence[Variant]) -> list[str]:
 
 
 def _caps(found: Sequence[Variant]) -> list[str]:
-    held = sorted({arm.title for arm in found for record in arm.records if record.summary.run.caps})
+    held = sorted({variant.title for variant in found for record in variant.records if record.summary.run.caps})
     return [f"counts held down by max_gaussians, so that shares of them say little: {', '.join(held)}"] if held else []
 
 

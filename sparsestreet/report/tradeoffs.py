@@ -1,4 +1,4 @@
-"""The cost of getting smaller: paired differences, and the best arm of a sweep at one quality or one size."""
+"""The cost of getting smaller: paired differences, and the best variant of a sweep at one quality or one size."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from sparsestreet.report.tables import (
 from sparsestreet.report.variants import Unit, Value, Variant, busy_variants, by_scene, mean_over_scenes, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
-"""Losses of full-image held-out PSNR, dB, that a smaller arm may have."""
+"""Losses of full-image held-out PSNR, dB, that a smaller variant may have."""
 SHARES = (0.25, 0.5, 0.75)
-"""Shares of the plain arm's Gaussians that a smaller arm may keep."""
+"""Shares of the plain variant's Gaussians that a smaller variant may keep."""
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,9 @@ def _held_out(metric: str) -> Value:
     return lambda run: run.mean(metric, HELD_OUT)
 
 
-def paired(arm: Variant, plain: Variant, value: Value, relative: bool = False) -> ConfidenceInterval | None:
-    """Returns the difference to the plain arm over the pairs of scene and seed that both arms have."""
-    ours, theirs = arm.units(value), plain.units(value)
+def paired(variant: Variant, plain: Variant, value: Value, relative: bool = False) -> ConfidenceInterval | None:
+    """Returns the difference to the plain variant over the pairs of scene and seed that both variants have."""
+    ours, theirs = variant.units(value), plain.units(value)
     differences = {
         unit: 100 * (ours[unit] / theirs[unit] - 1) if relative else ours[unit] - theirs[unit]
         for unit in ours.keys() & theirs.keys()
@@ -84,27 +84,27 @@ def interval_over_scenes(values: dict[Unit, float]) -> ConfidenceInterval | None
     return t_interval(list((scenes if len(scenes) > 1 else values).values()))
 
 
-def differences(arms: Sequence[Variant], protocol: Protocol) -> Grid:
-    """Returns the table that compares every arm with the plain arm of its method at the same place."""
-    shown = [one for one in measures(protocol) if any(arm.mean(one.value) is not None for arm in arms)]
+def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
+    """Returns the table that compares every variant with the plain variant of its method at the same place."""
+    shown = [one for one in measures(protocol) if any(variant.mean(one.value) is not None for variant in variants)]
     rows, alone = [], []
-    for arm in arms:
-        plain = plain_of(arm, arms)
-        if arm.sparsify == "none":
+    for variant in variants:
+        plain = plain_of(variant, variants)
+        if variant.sparsify == "none":
             continue
         if plain is None:
-            alone.append(arm.name)
+            alone.append(variant.name)
             continue
-        runs = tuple(record.folder.name for one in (arm, plain) for record in one.records)
-        found = [paired(arm, plain, one.steady, one.relative) for one in shown]
+        runs = tuple(record.folder.name for one in (variant, plain) for record in one.records)
+        found = [paired(variant, plain, one.steady, one.relative) for one in shown]
         n = max((interval.n for interval in found if interval), default=0)
         cells = [
             Cell(BUSY, runs=runs)
-            if interval is None and one.clock and (arm.busy(one.clock) or plain.busy(one.clock))
+            if interval is None and one.clock and (variant.busy(one.clock) or plain.busy(one.clock))
             else difference_cell(interval, one.text, n, runs)
             for interval, one in zip(found, shown, strict=True)
         ]
-        rows.append((Cell(f"{arm.title} - {_named(plain)}", runs=runs), Cell(str(n), runs=runs), *cells))
+        rows.append((Cell(f"{variant.title} - {_named(plain)}", runs=runs), Cell(str(n), runs=runs), *cells))
     notes = [
         f"differences paired by scene and seed, mean [{100 * CONFIDENCE:.0f} % t interval]; n: scenes, each the mean "
         "of its seeds, or the seeds of a single scene; bold where the interval excludes 0, never with n = 1",
@@ -113,23 +113,23 @@ def differences(arms: Sequence[Variant], protocol: Protocol) -> Grid:
     if alone:
         notes.append(f"no plain run (or several) at the same place to compare with: {', '.join(alone)}")
     header = (("", "arm - plain"), ("", "n"), *(("", f"{one.heading}{', %' if one.relative else ''}") for one in shown))
-    notes += [*_caps(arms), *busy_variants(arms)]
+    notes += [*_caps(variants), *busy_variants(variants)]
     return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
 
 
 def is_capped(plain: Variant) -> bool:
-    """Whether a limit ended the growth of a run of the arm."""
+    """Whether a limit ended the growth of a run of the variant."""
     return any(record.summary.run.caps for record in plain.records)
 
 
 def _named(plain: Variant) -> str:
-    """Returns the name of a plain arm, marked where its count is a limit's."""
+    """Returns the name of a plain variant, marked where its count is a limit's."""
     return f"{plain.name} {CAPPED}" if is_capped(plain) else plain.name
 
 
-def _caps(arms: Sequence[Variant]) -> tuple[str, ...]:
-    """Says what a share of a marked arm's Gaussians is a share of."""
-    held = [arm.name for arm in arms if arm.sparsify == "none" and is_capped(arm)]
+def _caps(variants: Sequence[Variant]) -> tuple[str, ...]:
+    """Says what a share of a marked variant's Gaussians is a share of."""
+    held = [variant.name for variant in variants if variant.sparsify == "none" and is_capped(variant)]
     said = "held down by max_gaussians, so that a share of its Gaussians is a share of that limit"
     return (f"{CAPPED} {', '.join(held)}: {said}",) if held else ()
 
@@ -156,51 +156,51 @@ def _exactly(interval: ConfidenceInterval) -> str:
 
 @dataclass(frozen=True)
 class _Candidate:
-    arm: Variant
+    variant: Variant
     plain: Variant
     loss: float
     """dB; positive if it is worse."""
     share: float
-    """Share of the plain arm's Gaussians that remains."""
+    """Share of the plain variant's Gaussians that remains."""
 
 
-def _candidates(plain: Variant, arms: Sequence[Variant], protocol: Protocol) -> list[_Candidate]:
+def _candidates(plain: Variant, variants: Sequence[Variant], protocol: Protocol) -> list[_Candidate]:
     found = []
-    for arm in arms:
-        if plain_of(arm, arms) is not plain:
+    for variant in variants:
+        if plain_of(variant, variants) is not plain:
             continue
-        loss = paired(arm, plain, _held_out(protocol.psnr))
-        share = paired(arm, plain, lambda run: float(run.gaussians_total), relative=True)
+        loss = paired(variant, plain, _held_out(protocol.psnr))
+        share = paired(variant, plain, lambda run: float(run.gaussians_total), relative=True)
         if loss is not None and share is not None:
-            found.append(_Candidate(arm, plain, -loss.mean, 1 + share.mean / 100))
+            found.append(_Candidate(variant, plain, -loss.mean, 1 + share.mean / 100))
     return found
 
 
-def matched_quality(arms: Sequence[Variant], protocol: Protocol) -> Grid:
-    """Returns the arms with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
+def matched_quality(variants: Sequence[Variant], protocol: Protocol) -> Grid:
+    """Returns the variants with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
     rows, notes = [], [f"{_OF_THIS_SWEEP}: plain counts as its own candidate", _NO_CONTROLS]
-    for plain in (arm for arm in arms if arm.sparsify == "none"):
+    for plain in (variant for variant in variants if variant.sparsify == "none"):
         for most in LOSSES:
-            allowed = [one for one in _candidates(plain, arms, protocol) if one.loss <= most]
+            allowed = [one for one in _candidates(plain, variants, protocol) if one.loss <= most]
             best, control = (min(some, key=lambda one: one.share, default=None) for some in _parted(allowed))
             rows.append((Cell(f"{_named(plain)}, at most {most:g} dB"), *_chosen(best)))
             if control is not None and (best is None or control.share < best.share):
                 notes.append(f"{rows[-1][0].text}: {_in_words(control)} is smaller")
-    notes += [*_caps(arms), *busy_variants(arms)]
+    notes += [*_caps(variants), *busy_variants(variants)]
     return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), tuple(notes))
 
 
-def matched_budget(arms: Sequence[Variant], protocol: Protocol) -> Grid:
-    """Returns the arms with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
+def matched_budget(variants: Sequence[Variant], protocol: Protocol) -> Grid:
+    """Returns the variants with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
     rows, notes = [], [_OF_THIS_SWEEP, _NO_CONTROLS]
-    for plain in (arm for arm in arms if arm.sparsify == "none"):
+    for plain in (variant for variant in variants if variant.sparsify == "none"):
         for share in SHARES:
-            allowed = [one for one in _candidates(plain, arms, protocol) if one.share <= share]
+            allowed = [one for one in _candidates(plain, variants, protocol) if one.share <= share]
             best, control = (min(some, key=lambda one: one.loss, default=None) for some in _parted(allowed))
             rows.append((Cell(f"{_named(plain)}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
             if control is not None and (best is None or control.loss < best.loss):
                 notes.append(f"{rows[-1][0].text}: {_in_words(control)} is better")
-    notes += [*_caps(arms), *busy_variants(arms)]
+    notes += [*_caps(variants), *busy_variants(variants)]
     return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), tuple(notes))
 
 
@@ -217,23 +217,23 @@ _CHOSEN = tuple(
 
 def _parted(candidates: Sequence[_Candidate]) -> tuple[list[_Candidate], list[_Candidate]]:
     """Returns those that are no controls, and the controls."""
-    controls = [one for one in candidates if one.arm.control]
-    return [one for one in candidates if not one.arm.control], controls
+    controls = [one for one in candidates if one.variant.control]
+    return [one for one in candidates if not one.variant.control], controls
 
 
 def _in_words(one: _Candidate) -> str:
-    return f"{one.arm.title}, {-one.loss:+.2f} dB at {100 * one.share:.0f} % of the Gaussians,"
+    return f"{one.variant.title}, {-one.loss:+.2f} dB at {100 * one.share:.0f} % of the Gaussians,"
 
 
 def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
     if best is None:
         return (Cell("none of this sweep"), *[Cell()] * (len(_CHOSEN) - 2))
-    runs = tuple(record.folder.name for record in best.arm.records)
+    runs = tuple(record.folder.name for record in best.variant.records)
 
     def mean(value: Value, form: str, clock: str = "") -> Cell:
-        ours, theirs = best.arm.units(value), best.plain.units(value)
+        ours, theirs = best.variant.units(value), best.plain.units(value)
         found = mean_over_scenes({unit: ours[unit] for unit in ours.keys() & theirs.keys()})
-        return number_cell(found, form, runs, best.arm.busy(clock) if clock else "")
+        return number_cell(found, form, runs, best.variant.busy(clock) if clock else "")
 
     numbers = (
         number_cell(-best.loss, "{:+.2f}", runs),
@@ -243,7 +243,7 @@ def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
         mean(lambda run: run.latency.p50, "{:.2f}", "frames"),
         mean(_minutes, "{:.2f}", "training"),
     )
-    return (Cell(best.arm.title, runs=runs), *numbers)
+    return (Cell(best.variant.title, runs=runs), *numbers)
 
 
 def _minutes(run: RunSummary) -> float | None:
@@ -251,38 +251,42 @@ def _minutes(run: RunSummary) -> float | None:
 
 
 LOSS = 0.3
-"""dB of full-image held-out PSNR that a smaller arm may lose on average."""
-FEWEST = 3
+"""dB of full-image held-out PSNR that a smaller variant may lose on average."""
+MIN_PAIRS = 3
 """Pairs of scenes, or of seeds of one scene, below which an interval says next to nothing: with two, a t interval is
 12.7 standard errors wide to each side."""
 
 
 @dataclass(frozen=True)
 class _Compared:
-    """An arm beside its plain one, over the scenes and seeds that both have."""
+    """A variant beside its plain one, over the scenes and seeds that both have."""
 
-    arm: Variant
+    variant: Variant
     gain: ConfidenceInterval
-    """dB, negative if the arm is worse."""
+    """dB, negative if the variant is worse."""
     kept: float
-    """Per cent of the plain arm's Gaussians."""
+    """Per cent of the plain variant's Gaussians."""
 
 
-def summary_line(arms: Sequence[Variant], protocol: Protocol) -> tuple[str, ...]:
-    """Returns a sentence for each plain arm, then what limits them; nothing for one whose others have too few pairs.
+def summary_line(variants: Sequence[Variant], protocol: Protocol) -> tuple[str, ...]:
+    """Return a sentence for each plain variant, then what limits them; nothing for one with too few pairs.
 
-    Controls are no way to get small and are left out. The mean of an arm decides, and its interval is stated: where it
-    reaches beyond the loss, a sentence says so.
+    Controls are no way to get small and are left out. The mean of a variant decides, and its interval is stated: where
+    it reaches beyond the loss, a sentence says so.
     """
     found, wide, held = [], [], []
-    for plain in (arm for arm in arms if arm.sparsify == "none"):
-        compared = [one for arm in arms if plain_of(arm, arms) is plain and (one := _compared(arm, plain, protocol))]
+    for plain in (variant for variant in variants if variant.sparsify == "none"):
+        compared = [
+            one
+            for variant in variants
+            if plain_of(variant, variants) is plain and (one := _compared(variant, plain, protocol))
+        ]
         if not compared:
             continue
         smaller = [one for one in compared if one.gain.mean >= -LOSS and one.kept < 100]
         best = min(smaller, key=lambda one: one.kept, default=None)
         found.append(_sentence(plain, compared, best))
-        wide += [best.arm.name] if best and best.gain.low is not None and best.gain.low < -LOSS else []
+        wide += [best.variant.name] if best and best.gain.low is not None and best.gain.low < -LOSS else []
         held += [plain.name] if is_capped(plain) else []
     if wide:
         found.append(
@@ -293,22 +297,22 @@ def summary_line(arms: Sequence[Variant], protocol: Protocol) -> tuple[str, ...]
     return tuple(found)
 
 
-def _compared(arm: Variant, plain: Variant, protocol: Protocol) -> _Compared | None:
-    if arm is plain or arm.control:
+def _compared(variant: Variant, plain: Variant, protocol: Protocol) -> _Compared | None:
+    if variant is plain or variant.control:
         return None
-    gain = paired(arm, plain, lambda run: run.mean(protocol.psnr, HELD_OUT))
-    share = paired(arm, plain, lambda run: float(run.gaussians_total), relative=True)
-    if gain is None or share is None or gain.n < FEWEST:
+    gain = paired(variant, plain, lambda run: run.mean(protocol.psnr, HELD_OUT))
+    share = paired(variant, plain, lambda run: float(run.gaussians_total), relative=True)
+    if gain is None or share is None or gain.n < MIN_PAIRS:
         return None
-    return _Compared(arm, gain, 100 + share.mean)
+    return _Compared(variant, gain, 100 + share.mean)
 
 
 def _sentence(plain: Variant, compared: Sequence[_Compared], best: _Compared | None) -> str:
     of = f"of {len(compared)} arms " if len(compared) > 1 else ""
     if best is None:
         nearest = max(compared, key=lambda one: one.gain.mean)
-        return f"{plain.name}: {of}none is smaller within {LOSS:g} dB; {nearest.arm.name} has {_numbers(nearest)}."
-    return f"{plain.name}: {of}the smallest within {LOSS:g} dB is {best.arm.name}, with {_numbers(best)}."
+        return f"{plain.name}: {of}none is smaller within {LOSS:g} dB; {nearest.variant.name} has {_numbers(nearest)}."
+    return f"{plain.name}: {of}the smallest within {LOSS:g} dB is {best.variant.name}, with {_numbers(best)}."
 
 
 def _numbers(one: _Compared) -> str:

@@ -42,12 +42,12 @@ COUNT_KEYS = (
 )
 """Options of a control that follow from the run whose size it copies, seed by seed."""
 
-_MOST_NAMED = 3
+_MAX_NAMED = 3
 """Largest number of options in the name of a column; the rest go into a note."""
-_LONGEST = 40
+_MAX_CHARACTERS = 40
 """Largest number of characters of an option in a name."""
 _NO_CHOICE = ("data", "hydra", "sweep", "out", "folder", "method", "sparsify", "assignment")
-"""Keys of a command that tell no arms of one label apart."""
+"""Keys of a command that tell no variants of one label apart."""
 
 
 @dataclass(frozen=True)
@@ -166,9 +166,9 @@ def in_few_words(options: Sequence[str], identity: str) -> str:
     >>> in_few_words(["split.stride=5", "seed=1"], identity="0123456789ab")
     'split.stride=5, seed=1'
     """
-    named = [_shortened(word) for word in options[:_MOST_NAMED]]
-    if len(options) > _MOST_NAMED:
-        named.append(f"and {len(options) - _MOST_NAMED} more #{identity[:6]}")
+    named = [_shortened(word) for word in options[:_MAX_NAMED]]
+    if len(options) > _MAX_NAMED:
+        named.append(f"and {len(options) - _MAX_NAMED} more #{identity[:6]}")
     return ", ".join(named)
 
 
@@ -178,13 +178,13 @@ def _shortened(word: str) -> str:
     >>> _shortened("callback.pruning.rule._target_=mypaper.rules.VolumeRule")
     'rule=VolumeRule'
     """
-    if len(word) <= _LONGEST:
+    if len(word) <= _MAX_CHARACTERS:
         return word
     key, equals, value = word.partition("=")
     if key.endswith("._target_"):
         key, value = key.removesuffix("._target_"), value.rpartition(".")[2]
     short = f"{key.rpartition('.')[2]}{equals}{value}"
-    return short if len(short) <= _LONGEST else f"{short[:_LONGEST]}..."
+    return short if len(short) <= _MAX_CHARACTERS else f"{short[:_MAX_CHARACTERS]}..."
 
 
 Value = Callable[[RunSummary], float | None]
@@ -193,7 +193,7 @@ Unit = tuple[tuple[str, str], int]
 """A scene with the part of its log, and a seed."""
 
 INCOMPLETE = "‡"
-"""Marks an arm that lacks runs which others at its place have: its means compare with none of theirs."""
+"""Marks a variant that lacks runs which others at its place have: its means compare with none of theirs."""
 
 
 @dataclass(frozen=True)
@@ -209,11 +209,11 @@ class Variant:
     records: tuple[RunRecord, ...]
     """Runs of both kinds: trained without the held-out views, and trained on all views."""
     lacks: tuple[str, ...] = ()
-    """Scenes and seeds, in words, that another arm at its place has and this one has not."""
+    """Scenes and seeds, in words, that another variant at its place has and this one has not."""
 
     @property
     def control(self) -> str | None:
-        """The kind of control, which is sized to match another arm; None for any other arm."""
+        """The kind of control, which is sized to match another variant; None for any other variant."""
         return control_of(self.records[0].summary)
 
     @property
@@ -227,7 +227,7 @@ class Variant:
 
     @property
     def plain_label(self) -> str:
-        """The label of the plain arm that it is compared with."""
+        """The label of the plain variant that it is compared with."""
         return self.label.partition("+")[0]
 
     def runs(self, whole: bool = False) -> dict[Unit, list[RunRecord]]:
@@ -261,12 +261,12 @@ class Variant:
 
 
 def busy_variants(found: Iterable[Variant]) -> list[str]:
-    """Returns a note that names the arms with times of a machine that was not quiet, or nothing."""
-    return busy_note((arm.name, record.summary) for arm in found for record in arm.records)
+    """Returns a note that names the variants with times of a machine that was not quiet, or nothing."""
+    return busy_note((variant.name, record.summary) for variant in found for record in variant.records)
 
 
 def unit_of(run: RunSummary) -> Unit:
-    """Returns the key by which runs of two arms are paired."""
+    """Returns the key by which runs of two variants are paired."""
     return (run.run.scene, config_hash(only(run.run.config, CLIP_KEYS))), run.run.seed
 
 
@@ -293,7 +293,7 @@ def by_scene(units: dict[Unit, float]) -> dict[tuple[str, str], float]:
 
 
 def variants(records: Sequence[RunRecord]) -> list[Variant]:
-    """Groups the runs of a sweep into arms, sorted by method; plain arms come before pruned ones, controls last."""
+    """Return the variants of a sweep, sorted by method; plain ones come before pruned ones, controls last."""
     folder_of = {id(record.summary): record for record in records}
     of_log, of_split = _logs_in_words(records), _splits_in_words(records)
     places = {
@@ -312,24 +312,32 @@ def variants(records: Sequence[RunRecord]) -> list[Variant]:
             run = group[0].summary.run
             name = f"{variant.name} ({words})" if words else variant.name
             found.append(Variant(name, variant.label, run.method, run.sparsify, place, tuple(group)))
-    found = [replace(arm, lacks=_lacks(arm, found)) for arm in found]
-    return sorted(found, key=lambda arm: (arm.plain_label, arm.control is not None, arm.sparsify != "none", arm.name))
+    found = [replace(variant, lacks=_lacks(variant, found)) for variant in found]
+    return sorted(
+        found,
+        key=lambda variant: (
+            variant.plain_label,
+            variant.control is not None,
+            variant.sparsify != "none",
+            variant.name,
+        ),
+    )
 
 
-def _units_of(arm: Variant) -> set[tuple[bool, Unit]]:
-    return {(whole, unit) for whole in (False, True) for unit in arm.runs(whole)}
+def _units_of(variant: Variant) -> set[tuple[bool, Unit]]:
+    return {(whole, unit) for whole in (False, True) for unit in variant.runs(whole)}
 
 
-def _lacks(arm: Variant, among: Sequence[Variant]) -> tuple[str, ...]:
-    own = _units_of(arm)
-    others = {unit for other in among if other.place == arm.place for unit in _units_of(other)}
+def _lacks(variant: Variant, among: Sequence[Variant]) -> tuple[str, ...]:
+    own = _units_of(variant)
+    others = {unit for other in among if other.place == variant.place for unit in _units_of(other)}
     words = ((scene, seed, ", all views" if whole else "") for whole, ((scene, _), seed) in sorted(others - own))
     return tuple(f"{scene} seed {seed}{kind}" for scene, seed, kind in words)
 
 
 def incomplete(found: Sequence[Variant]) -> list[str]:
-    """Returns a note on the arms that lack runs which others have, or nothing."""
-    lacking = [f"{arm.name} lacks {_few(arm.lacks)}" for arm in found if arm.lacks]
+    """Returns a note on the variants that lack runs which others have, or nothing."""
+    lacking = [f"{variant.name} lacks {_few(variant.lacks)}" for variant in found if variant.lacks]
     if not lacking:
         return []
     return [
@@ -342,12 +350,12 @@ def _few(words: Sequence[str], most: int = 3) -> str:
     return ", ".join(words[:most]) + (f" and {len(words) - most} more" if len(words) > most else "")
 
 
-def plain_of(arm: Variant, among: Iterable[Variant]) -> Variant | None:
-    """Returns the plain arm of the same method at the same place; None if there is none or several."""
+def plain_of(variant: Variant, among: Iterable[Variant]) -> Variant | None:
+    """Returns the plain variant of the same method at the same place; None if there is none or several."""
     plain = [
         other
         for other in among
-        if other.sparsify == "none" and other.label == arm.plain_label and other.place == arm.place
+        if other.sparsify == "none" and other.label == variant.plain_label and other.place == variant.place
     ]
     return plain[0] if len(plain) == 1 else None
 
@@ -358,14 +366,14 @@ def why_apart(found: Sequence[Variant]) -> list[str]:
         return []
     said = []
     names = ("devices", "numbers of threads", "commits", "data of one name", "options of the log", "splits")
-    for name, column in zip(names, zip(*(arm.place for arm in found), strict=True), strict=True):
+    for name, column in zip(names, zip(*(variant.place for variant in found), strict=True), strict=True):
         if len(set(column)) > 1:
             said.append(f"runs differ in {name} ({', '.join(sorted(set(column)))}): shown apart, never averaged")
-    labels = [arm.label for arm in found]
+    labels = [variant.label for variant in found]
     several = sorted({label for label in labels if labels.count(label) > 1})
     if several:
         said.append(f"{', '.join(several)}: runs of one label that differ are rows of their own, never averaged")
-    dirty = sorted({arm.name for arm in found for record in arm.records if record.summary.run.source.dirty})
+    dirty = sorted({variant.name for variant in found for record in variant.records if record.summary.run.source.dirty})
     if dirty:
         said.append(f"made by code with uncommitted changes: {', '.join(dirty)}")
     return said

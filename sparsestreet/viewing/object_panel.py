@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from sparsestreet.viewing.edit_state import Offset, own_frame
 from sparsestreet.viewing.stage import Eye, Stage
 
-_LARGEST = 16_384
+_MAX_CANVAS = 16_384
 """Pixels of a side of a window."""
 
 
@@ -23,7 +23,7 @@ def eye_of(camera: Any) -> Eye | None:
     width, height = int(camera.image_width), int(camera.image_height)
     if not np.isfinite(numbers).all() or not np.linalg.norm(numbers[:4]) > 0:
         return None
-    if not (0 < numbers[7] < math.pi and 0 < width <= _LARGEST and 0 < height <= _LARGEST):
+    if not (0 < numbers[7] < math.pi and 0 < width <= _MAX_CANVAS and 0 < height <= _MAX_CANVAS):
         return None
     return Eye(matrix(numbers[:4], numbers[4:7]), float(numbers[7]), width, height)
 

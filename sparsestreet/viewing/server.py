@@ -18,7 +18,7 @@ from sparsestreet.types import View
 from sparsestreet.viewing.object_panel import ObjectPanel, eye_of, show_from
 from sparsestreet.viewing.stage import Eye, Stage
 
-_FEWEST, _MOST = 40_000.0, 1920.0 * 1080
+_MIN_PIXELS, _MAX_PIXELS = 40_000.0, 1920.0 * 1080
 """Pixels of a picture while the camera moves. Below, a frame is no faster: all Gaussians are placed in any case."""
 _QUICKEST = 2.0
 """Largest factor of a change between two frames; the square root of it is taken, since one frame is a noisy measure."""
@@ -41,7 +41,7 @@ class Pace:
     def note(self, seconds: float) -> None:
         """A frame of ``pixels`` took so long."""
         factor = min(max(self.budget / max(seconds, 1e-6), 1 / _QUICKEST), _QUICKEST)
-        self.pixels = min(max(self.pixels * math.sqrt(factor), _FEWEST), _MOST)
+        self.pixels = min(max(self.pixels * math.sqrt(factor), _MIN_PIXELS), _MAX_PIXELS)
 
     def size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height of a frame of a window, in its proportions and no larger.
@@ -64,7 +64,7 @@ def fitted(width: int, height: int, pixels: float) -> tuple[int, int]:
 
 REST = 0.2
 """Seconds without a change after which nothing moves."""
-LARGEST = 1920.0 * 1200
+MAX_STILL = 1920.0 * 1200
 """Pixels of a picture at rest."""
 _SHORTEST = 1 / 30
 """Seconds from one picture to the next: browsers show no more."""
@@ -105,7 +105,7 @@ class Canvas:
         if self._stale and now - self._drawn >= _SHORTEST:
             return Shot(self.eye, *self.pace.size(width, height), whole=False)
         if not self._stale and not self._whole and now - self._changed >= REST:
-            return Shot(self.eye, *fitted(width, height, LARGEST), whole=True)
+            return Shot(self.eye, *fitted(width, height, MAX_STILL), whole=True)
         return None
 
     def drawn(self, shot: Shot, seconds: float, now: float) -> None:

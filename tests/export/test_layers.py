@@ -8,8 +8,8 @@ import torch
 
 from sparsestreet.data.lazy import Sweeps
 from sparsestreet.export.layers import (
-    FARTHEST,
     LAYERS,
+    MAX_MILLIMETERS,
     LidarReturns,
     count_images,
     enlarged,
@@ -56,8 +56,8 @@ def test_what_is_farther_than_65_meters_says_so():
         stored.scene.nodes["background"].rows.means[:] = torch.tensor([100.0, 0.0, 1.5])
         stored.scene.nodes["background"].rows.log_scales[:] = 2.0
     depth = layer_values(stored, VIEW, ["depth"])["depth"]
-    assert set(np.unique(depth)) <= {0, FARTHEST}
-    assert (depth == FARTHEST).any()
+    assert set(np.unique(depth)) <= {0, MAX_MILLIMETERS}
+    assert (depth == MAX_MILLIMETERS).any()
 
 
 def test_a_lone_object_is_where_it_covers_more_than_half():
@@ -252,7 +252,7 @@ def test_the_nearest_return_of_a_pixel_in_millimeters():
     values = layer_values(stored_street(), VIEW, ["lidar"], returns({1: places}))["lidar"]
     assert values.dtype == np.uint16
     assert values[7, 10] == 12345
-    assert values[30, 40] == FARTHEST
+    assert values[30, 40] == MAX_MILLIMETERS
     assert np.count_nonzero(values) == 2
 
 

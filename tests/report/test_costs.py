@@ -1,4 +1,4 @@
-"""What each arm costs, in absolute numbers."""
+"""What each variant costs, in absolute numbers."""
 
 from dataclasses import replace
 from typing import Any
@@ -144,8 +144,8 @@ def test_runs_of_one_scene_and_seed_are_their_mean(tmp_path):
     for name, seconds, psnr, split in (("a", 10.0, 20.0, "some"), ("b", 12.0, 21.0, "some"), ("c", 99.0, 9.0, "none")):
         HELD_OUT_CURVE.write(tmp_path / name, [HeldOutLook(seconds, 9, psnr, None, None)])
         runs.append(record(make_summary("plain", split=split, training_psnr=20.0), str(tmp_path / name)))
-    (arm,) = variants(runs)
-    assert list(curves_of(arm).values()) == [QualityCurve((11.0,), (20.5,))]
+    (variant,) = variants(runs)
+    assert list(curves_of(variant).values()) == [QualityCurve((11.0,), (20.5,))]
 
 
 def test_seconds_to_the_plain_runs_quality(tmp_path):

@@ -62,7 +62,7 @@ def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
     text = path.read_text()
     titles = [name for name in ("full image", "people", "vehicles") if f">{name}<" in text]
     assert titles == ["full image", "vehicles"]  # no run measured people
-    # 3 runs and a mean, of a plain, a pruned and a grey arm, in 2 panels.
+    # 3 runs and a mean, of a plain, a pruned and a grey variant, in 2 panels.
     assert [len(re.findall(rf"<use [^>]*fill: {paint}", text, re.I)) for paint in (COLORS[0], COLORS[2])] == [8, 8]
     assert len(re.findall(rf"<use [^>]*stroke: {GREY}", text)) >= 2 * 4
     assert "control: random" in text
@@ -125,8 +125,8 @@ def test_a_bar_is_the_mean_over_runs(tmp_path):
     for seed, ms in enumerate((1.0, 4.0)):
         update_costs(tmp_path / str(seed), nodes={"rigid": NodeCost(10, 0.1, 4.0, ms)}, effects={"sky": 2 * ms})
         runs.append(record(make_summary("plain", seed), str(tmp_path / str(seed))))
-    (arm,) = variants(runs)
-    assert _frame_costs(arm) == {"rigid": 2.5, "effect: sky": 5.0}
+    (variant,) = variants(runs)
+    assert _frame_costs(variant) == {"rigid": 2.5, "effect: sky": 5.0}
 
 
 def test_counts_are_of_all_nodes(tmp_path):
@@ -134,8 +134,8 @@ def test_counts_are_of_all_nodes(tmp_path):
     starts = [CountChange(0, name, 0, rows, "start") for name, rows in (("background", 100), ("rigid", 20))]
     LEDGER.write(tmp_path, [*starts, CountChange(5, "background", 100, 30, PRUNING)])
     axes = Figure().subplots()
-    (arm,) = variants([record(make_summary("plain"))])
-    _counts(axes, styles([arm])[arm.name], tmp_path)
+    (variant,) = variants([record(make_summary("plain"))])
+    _counts(axes, styles([variant])[variant.name], tmp_path)
     line, dots = ([np.asarray(values).tolist() for values in drawn.get_data()] for drawn in axes.get_lines())
     assert (line, dots) == ([[0, 5], [120, 50]], [[5], [50]])
 
@@ -216,7 +216,7 @@ def arrows(axes):
 )
 def test_a_panel_has_marks_arrows_and_the_front(canvas, tmp_path, cost, x):
     found = two_methods()
-    assert [arm.name for arm in found] == ["a", "a+paper", "a+random", "b", "b+removal"]
+    assert [variant.name for variant in found] == ["a", "a+paper", "a+random", "b", "b+removal"]
     assert pareto(found, DRIVESTUDIO, cost, tmp_path / "p.svg")
     full, vehicles = canvas["p.svg"].axes
     assert [axes.get_title() for axes in (full, vehicles)] == ["full image", "vehicles"]
@@ -256,7 +256,7 @@ def test_marks_in_the_legend_are_those_of_the_panel(canvas, tmp_path):
     assert list(handles) == ["a", "b", "plain", "paper", "control: random", "removal", "front of the means"]
     assert [handles[name].get_color() for name in ("a", "b", "control: random")] == [*COLORS[:2], GREY]
     assert [handles[name].get_marker() for name in list(handles)[2:6]] == ["o", "s", "x", "D"]
-    assert [styles(found)[arm.name].marker for arm in found] == ["o", "s", "x", "o", "D"]
+    assert [styles(found)[variant.name].marker for variant in found] == ["o", "s", "x", "o", "D"]
 
 
 def test_a_figure_of_one_region_or_none(canvas, tmp_path):
@@ -272,7 +272,7 @@ def test_a_figure_of_one_region_or_none(canvas, tmp_path):
 
 
 def test_bars_of_a_frame_lie_behind_each_other(canvas, tmp_path):
-    """Each arm has a row, each part a color; an effect is hatched."""
+    """Each variant has a row, each part a color; an effect is hatched."""
     parts = {"a": (3.0, 1.0, 0.5), "a+paper": (1.5, 0.25, 0.75)}
     for name, (road, cars, sky) in parts.items():
         nodes = {node: NodeCost(10, 0.1, 4.0, ms) for node, ms in (("road", road), ("cars", cars))}
@@ -366,7 +366,7 @@ def test_marks_say_what_they_are(found, tmp_path):
         f"streetgs, street {seed}, seed {seed}: {25 + seed}.000 dB, 10,000 Gaussians" for seed in range(3)
     ]
     assert said.count("streetgs, mean: 26.000 dB, 10,000 Gaussians") == 1
-    assert len(said) == 4 * 3 * 2  # three runs and a mean of three arms, in two panels
+    assert len(said) == 4 * 3 * 2  # three runs and a mean of three variants, in two panels
     assert ' runs"' not in text
     figure, (axes,) = panels(1)
     axes.scatter([1.0], [2.0], gid="one")
@@ -382,7 +382,7 @@ RULES = [
 
 
 def of_a_sweep(folder):
-    """Twelve arms of one method: four sparsifications with three rules each, told apart by a group alone."""
+    """Twelve variants of one method: four sparsifications with three rules each, told apart by a group alone."""
     for index, (sparsify, kind) in enumerate(RULES):
         run = folder / f"{index}"
         command = f"sparsestreet train sparsify={sparsify} pruning@callback.pruning.rule={kind}"
@@ -435,7 +435,7 @@ def test_names_of_bars_do_not_run_into_each_other(tmp_path, canvas):
     figure = canvas["w.svg"]
     FigureCanvasAgg(figure).draw()
     boxes = [text.get_window_extent() for text in figure.axes[0].get_yticklabels()]
-    assert len(boxes) == 3  # two of the runs are of one arm
+    assert len(boxes) == 3  # two of the runs are of one variant
     assert not any(one.overlaps(other) for index, one in enumerate(boxes) for other in boxes[:index])
 
 
@@ -455,10 +455,10 @@ def test_without_held_out_views_there_is_none(tmp_path):
 
 def test_arms_of_one_method_differ_in_color_and_those_of_several_by_method():
     one = variants([record(make_summary(label)) for label in ("a", "a+paper")])
-    assert len({_paint_figures_readme(arm, one) for arm in one}) == 2
+    assert len({_paint_figures_readme(variant, one) for variant in one}) == 2
     several = [*one, *variants([record(make_summary("b"))])]
-    assert len({_paint_figures_readme(arm, several) for arm in one}) == 1
-    assert len({_paint_figures_readme(arm, several) for arm in several}) == 2
+    assert len({_paint_figures_readme(variant, several) for variant in one}) == 1
+    assert len({_paint_figures_readme(variant, several) for variant in several}) == 2
 
 
 def figure_of(runs, tmp_path, monkeypatch):

@@ -68,11 +68,11 @@ def test_table_4_holds_the_inception_distance_alone(tmp_path):
     summary = make_summary("omnire", scene="023")
     object.__setattr__(summary.run, "method", "omnire")
     write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0})
-    (arm,) = variants([record(summary, str(tmp_path))])
-    grid = paper_table([arm], [], DRIVESTUDIO, "table4_novel")
+    (variant,) = variants([record(summary, str(tmp_path))])
+    grid = paper_table([variant], [], DRIVESTUDIO, "table4_novel")
     assert [cell.text for cell in grid.rows[0]] == ["omnire", "1", "42.00", "43.62", "-", "61.56", "-", "75.14"]
     write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0}, name="frechet_alexnet")
-    assert paper_table([arm], [], DRIVESTUDIO, "table4_novel").rows[0][2].text == "-"
+    assert paper_table([variant], [], DRIVESTUDIO, "table4_novel").rows[0][2].text == "-"
 
 
 def test_none_recorded_no_table(tmp_path):

@@ -70,8 +70,8 @@ def test_a_failed_folder_with_an_old_record_is_no_run(tmp_path):
 
 def test_it_says_what_follows_from_it(page):
     """-0.2, -0.3, -0.4 dB of three streets, a quarter of the Gaussians."""
-    (verdict,) = re.findall(r"<section id='verdict'>(.*?)</section>", page.read_text())
-    assert "streetgs: the smallest within 0.3 dB is streetgs+removal, with 25 % of the Gaussians, -0.30 dB" in verdict
+    (said,) = re.findall(r"<section id='verdict'>(.*?)</section>", page.read_text())
+    assert "streetgs: the smallest within 0.3 dB is streetgs+removal, with 25 % of the Gaussians, -0.30 dB" in said
 
 
 @pytest.mark.slow
@@ -294,9 +294,9 @@ def test_figures_have_their_own_width_and_one_heading():
 @pytest.mark.parametrize(
     ("had", "seed", "shown"),
     [
-        # Seed 0 is the lowest, and half of the arms lack it.
+        # Seed 0 is the lowest, and half of the variants lack it.
         ([("plain", 0), ("plain", 1), ("plain+removal", 1)], 1, ["plain", "plain+removal"]),
-        # No seed is in two arms: the lowest, and no picture of another seed beside it.
+        # No seed is in two variants: the lowest, and no picture of another seed beside it.
         ([("plain", 0), ("plain+removal", 1)], 0, ["plain"]),
         ([("plain", 1), ("plain", 2), ("plain+removal", 2), ("plain+removal", 1)], 1, ["plain", "plain+removal"]),
     ],

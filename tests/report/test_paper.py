@@ -165,15 +165,15 @@ def test_headers_and_notes_of_a_table():
 
 
 def test_words_of_a_rows_options_choose_its_arm():
-    """Rows of one method and sparsification differ in what an arm's name says."""
+    """Rows of one method and sparsification differ in what a variant's name says."""
     table = TABLES["table3_pruning"]
     named = [row for row in table.rows if row.options]
     assert named
     for row in table.rows:
         name = " ".join((row.method or "", *row.options))
         summary = make_summary("x")
-        arm = Variant(name, "x", row.method or "", row.sparsify, (), (record(summary),))
-        grid = paper_table([arm], [], DRIVESTUDIO, "table3_pruning")
+        variant = Variant(name, "x", row.method or "", row.sparsify, (), (record(summary),))
+        grid = paper_table([variant], [], DRIVESTUDIO, "table3_pruning")
         assert grid.rows[[one.name for one in table.rows].index(row.name)][0].text == name
 
 

@@ -1,4 +1,4 @@
-"""Differences and best arms against numbers worked out by hand."""
+"""Differences and best variants against numbers worked out by hand."""
 
 from dataclasses import replace
 
@@ -102,7 +102,7 @@ def test_the_best_arm_of_a_budget(found):
 
 
 def test_a_larger_arm_within_the_budget_is_better():
-    """Of two arms below half of the Gaussians the one that loses less, not the smaller one."""
+    """Of two variants below half of the Gaussians the one that loses less, not the smaller one."""
     counts = {"plain": (25.0, 1000), "plain+small": (23.0, 100), "plain+larger": (24.5, 400)}
     runs = [make_summary(label, 0, psnr, {"background": rows}) for label, (psnr, rows) in counts.items()]
     grid = matched_budget(variants([record(run) for run in runs]), DRIVESTUDIO)
@@ -112,7 +112,7 @@ def test_a_larger_arm_within_the_budget_is_better():
 
 
 def test_a_control_is_never_chosen_but_named():
-    """The capped method is smaller and better than what it controls: the tables choose the arm and say so."""
+    """The capped method is smaller and better than what it controls: the tables choose the variant and say so."""
     runs = {"plain": (25.0, 1000), "plain+removal": (24.8, 400), "plain+capped": (24.9, 300)}
     made = variants([record(make_summary(name, 0, psnr, {"background": n})) for name, (psnr, n) in runs.items()])
     quality, budget = matched_quality(made, DRIVESTUDIO), matched_budget(made, DRIVESTUDIO)
@@ -126,7 +126,7 @@ def test_a_control_is_never_chosen_but_named():
 
 
 def test_a_chosen_arm_has_the_numbers_of_the_seeds_it_shares():
-    """Seed 1, which the plain arm lacks, has 900 Gaussians and is in no number of the row."""
+    """Seed 1, which the plain variant lacks, has 900 Gaussians and is in no number of the row."""
     runs = [("plain", 0, 25.0, 1000), ("plain+removal", 0, 24.9, 300), ("plain+removal", 1, 20.0, 900)]
     made = variants([record(make_summary(name, seed, psnr, {"background": n})) for name, seed, psnr, n in runs])
     chosen = by_heading(matched_quality(made, DRIVESTUDIO), matched_quality(made, DRIVESTUDIO).rows[-1])
@@ -134,7 +134,7 @@ def test_a_chosen_arm_has_the_numbers_of_the_seeds_it_shares():
 
 
 def test_a_gain_is_no_loss():
-    """An arm that is smaller and better by 0.6 dB is within every limit."""
+    """A variant that is smaller and better by 0.6 dB is within every limit."""
     runs = [make_summary("plain", 0, 25.0), make_summary("plain+removal", 0, 25.6, {"background": 300})]
     grid = matched_quality(variants([record(run) for run in runs]), DRIVESTUDIO)
     chosen = [by_heading(grid, row) for row in grid.rows]
@@ -218,7 +218,7 @@ def test_who_has_no_plain_value_has_no_relative_difference():
 
 
 def test_a_difference_of_times_is_of_quiet_pairs_alone():
-    """Of the plain frames one seed was disturbed, of the small arm's training every seed."""
+    """Of the plain frames one seed was disturbed, of the small variant's training every seed."""
     runs = [
         disturbed(make_summary("plain", 0, milliseconds=900.0), "frames"),
         make_summary("plain", 1, milliseconds=20.0),
@@ -274,7 +274,7 @@ def test_none_is_within_the_loss():
 
 def test_two_pairs_say_nothing():
     assert said(PLAIN[:2], GOOD[:2]) == ()
-    assert said(PLAIN, GOOD[1:]) == ()  # of three seeds the arm has two
+    assert said(PLAIN, GOOD[1:]) == ()  # of three seeds the variant has two
     assert said(PLAIN) == ()
     assert said(GOOD) == ()
 

@@ -165,7 +165,7 @@ def psnr(run):
 
 
 def test_controls_of_other_counts_are_one_arm():
-    found = {arm.name: arm for arm in variants([record(run, name) for name, run in street_runs().items()])}
+    found = {variant.name: variant for variant in variants([record(run, name) for name, run in street_runs().items()])}
     assert list(found) == ["streetgs", "streetgs+removal", "streetgs+random"]
     control = found["streetgs+random"]
     assert control.title == "control: streetgs+random"
@@ -182,7 +182,7 @@ def test_a_sparsification_says_itself_that_it_is_a_control():
         make_summary("streetgs+size", config={"sparsify.control": "as many Gaussians, the smallest"}),
         make_summary("streetgs+opacity"),
     ]
-    found = {arm.name: arm.control for arm in variants([record(run) for run in runs])}
+    found = {variant.name: variant.control for variant in variants([record(run) for run in runs])}
     known = {"streetgs+opacity": "as many Gaussians, the most opaque"}
     assert found == {"streetgs": None, "streetgs+size": "as many Gaussians, the smallest"} | known
 
@@ -193,13 +193,13 @@ def test_each_scene_counts_once():
         make_summary("plain", 1, 22.0, scene="a"),
         make_summary("plain", 0, 30.0, scene="b"),
     ]
-    (arm,) = variants([record(run) for run in runs])
-    assert arm.mean(psnr) == 25.5
+    (variant,) = variants([record(run) for run in runs])
+    assert variant.mean(psnr) == 25.5
 
 
 def test_several_runs_of_one_seed_are_their_mean():
-    (arm,) = variants([record(make_summary("plain", 0, psnr)) for psnr in (20.0, 23.0)])
-    assert list(arm.units(psnr).values()) == [21.5]
+    (variant,) = variants([record(make_summary("plain", 0, psnr)) for psnr in (20.0, 23.0)])
+    assert list(variant.units(psnr).values()) == [21.5]
 
 
 def test_two_parts_of_one_log_are_two_scenes():
@@ -234,8 +234,8 @@ def test_two_parts_of_one_log_are_two_scenes():
 )
 def test_runs_that_differ_are_never_averaged(other, said):
     found = variants([record(make_summary("plain", 0, 20.0)), record(make_summary("plain", 1, 30.0, **other))])
-    assert [len(arm.records) for arm in found] == [1, 1]
-    assert len({arm.name for arm in found}) == 2
+    assert [len(variant.records) for variant in found] == [1, 1]
+    assert len({variant.name for variant in found}) == 2
     assert any(note.startswith(said) for note in why_apart(found))
 
 
@@ -244,7 +244,7 @@ def test_options_of_the_log_name_arms_in_few_words():
     read = {"data.log.lidar": True, "data.log.width": 480, "data.log.root": "/a", "data.log.first_frame": 0}
     other = read | {"data.log.width": 960, "data.log.root": "/b", "data.log.first_frame": 30}
     runs = [make_summary("plain", config=config) for config in (read, other, other | {"data.log.lidar": False})]
-    names = {arm.name for arm in variants([record(run) for run in runs])}
+    names = {variant.name for variant in variants([record(run) for run in runs])}
     assert names == {
         "plain (data.log.lidar=true, data.log.width=480)",
         "plain (data.log.lidar=true, data.log.width=960)",
@@ -255,7 +255,7 @@ def test_options_of_the_log_name_arms_in_few_words():
 def test_no_comparison_between_places():
     runs = [make_summary("plain", 0), make_summary("plain+removal", 0, threads=1)]
     found = variants([record(run) for run in runs])
-    assert [plain_of(arm, found) is None for arm in found] == [False, True]
+    assert [plain_of(variant, found) is None for variant in found] == [False, True]
 
 
 def test_one_place_has_nothing_to_say():
@@ -269,9 +269,9 @@ def test_runs_on_all_views_stand_apart():
     """DriveStudio's two trainings: reconstruction is of the one without held-out views."""
     held = make_summary("plain", 0, 20.0, training_psnr=25.0)
     whole = make_summary("plain", 0, None, training_psnr=28.0, split="none")
-    (arm,) = variants([record(held), record(whole)])
-    assert list(arm.units(psnr).values()) == [20.0]
-    assert list(arm.units(psnr, whole=True).values()) == [28.0]
+    (variant,) = variants([record(held), record(whole)])
+    assert list(variant.units(psnr).values()) == [20.0]
+    assert list(variant.units(psnr, whole=True).values()) == [28.0]
 
 
 def test_data_that_differ_under_one_name_stand_apart():
@@ -279,15 +279,15 @@ def test_data_that_differ_under_one_name_stand_apart():
     for run, data_hash in zip(runs, ("aaaaaaaa", "bbbbbbbb"), strict=True):
         object.__setattr__(run.run, "data_hash", data_hash)
     found = variants([record(run) for run in runs])
-    assert [arm.name for arm in found] == ["plain (data aaaaaa)", "plain (data bbbbbb)"]
+    assert [variant.name for variant in found] == ["plain (data aaaaaa)", "plain (data bbbbbb)"]
     assert why_apart(found)[0].startswith("runs differ in data of one name (data aaaaaa, data bbbbbb)")
 
 
 def test_an_arm_that_lacks_seeds_is_marked_everywhere():
-    """Of three seeds the masks have one; other places and arms with all seeds say nothing."""
+    """Of three seeds the masks have one; other places and variants with all seeds say nothing."""
     runs = [make_summary("plain", seed) for seed in (0, 1, 2)] + [make_summary("plain+masks", 1)]
     found = variants([record(run) for run in (*runs, make_summary("plain+masks", 5, threads=1))])
-    assert [(arm.label, arm.title.removeprefix(arm.name)) for arm in found] == [
+    assert [(variant.label, variant.title.removeprefix(variant.name)) for variant in found] == [
         ("plain", ""),
         ("plain+masks", ""),
         ("plain+masks", " (1 of 3 runs ‡)"),
