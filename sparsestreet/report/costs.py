@@ -1,73 +1,54 @@
 """What each variant costs: size, time and memory, its effects, and the seconds to a quality."""
 
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sparsestreet.records.costs import COSTS, PRUNE, CostRecord, EffectGain
+import pandas as pd
+
+from sparsestreet.records.costs import COSTS, CostRecord, EffectGain
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.run import EffectDecision
-from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.tables import ABSENT, BUSY, Cell, Grid, number_cell
 from sparsestreet.report.variants import Unit, Variant, busy_variants, plain_of
 
 _CLOCK_OF = {"ms/frame": "frames", "train s": "training"} | dict.fromkeys(("seconds", "ms of a step"), "training")
 """Heading, or shared heading, of a column of times -> what its machine was measured with."""
 
-_COLUMNS: tuple[tuple[str, str, str, Callable[[RunRecord], float | None]], ...] = (
-    ("", "Gaussians", "{:,.0f}", lambda record: float(record.summary.gaussians_total)),
-    ("", "MB", "{:.2f}", lambda record: record.summary.bytes_total / 1e6),
-    ("", "ms/frame", "{:.2f}", lambda record: record.summary.latency.p50),
-    ("", "train s", "{:.1f}", lambda record: record.summary.run.training_seconds),
-    ("seconds", "pruning", "{:.1f}", lambda record: _of(record, lambda costs: costs.phases.get(PRUNE, 0.0))),
-    ("seconds", "whole command", "{:.0f}", lambda record: _of(record, lambda costs: costs.wall_seconds)),
-    ("ms of a step", "forward", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, *_forward(costs)))),
-    ("ms of a step", "backward", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, "backward"))),
-    ("ms of a step", "optimizer", "{:.1f}", lambda record: _of(record, lambda costs: _step(costs, "optimizer"))),
-    ("peak MB", "host", "{:.0f}", lambda record: _of(record, lambda costs: costs.peak_host_mb)),
-    ("peak MB", "GPU", "{:.0f}", lambda record: _of(record, lambda costs: costs.peak_device_mb)),
+_COLUMNS = (
+    ("", "Gaussians", "{:,.0f}"),
+    ("", "MB", "{:.2f}"),
+    ("", "ms/frame", "{:.2f}"),
+    ("", "train s", "{:.1f}"),
+    ("seconds", "pruning", "{:.1f}"),
+    ("seconds", "whole command", "{:.0f}"),
+    *(("ms of a step", part, "{:.1f}") for part in ("forward", "backward", "optimizer")),
+    ("peak MB", "host", "{:.0f}"),
+    ("peak MB", "GPU", "{:.0f}"),
 )
+"""Shared heading, heading (which is the column of ``run_frame``) and format."""
 
 
 def what_variants_cost(variants: Sequence[Variant]) -> Grid:
-    """Returns size, speed, time and memory of every variant, as means over its runs."""
-    shown = [column for column in _COLUMNS if any(_mean(variant, column[3]) is not None for variant in variants)]
+    """Return size, speed, time and memory of every variant, as means over its runs."""
+    names = [heading for _, heading, _ in _COLUMNS]
+    means = {variant.name: {name: _mean(variant.frame.get(name, ())) for name in names} for variant in variants}
+    shown = [column for column in _COLUMNS if any(one[column[1]] is not None for one in means.values())]
     rows = []
     for variant in variants:
-        runs = tuple(record.folder.name for record in variant.records)
-        clocks = [_CLOCK_OF.get(group or heading) for group, heading, _, _ in shown]
-        marks = [variant.busy(clock) if clock else "" for clock in clocks]
+        runs = variant.run_names
+        clocks = [_CLOCK_OF.get(group or heading) for group, heading, _ in shown]
         cells = [
-            number_cell(_mean(variant, value), form, runs, mark)
-            for (_, _, form, value), mark in zip(shown, marks, strict=True)
+            number_cell(means[variant.name][heading], form, runs, variant.busy(clock) if clock else "")
+            for (_, heading, form), clock in zip(shown, clocks, strict=True)
         ]
         rows.append((Cell(variant.title, runs=runs), Cell(str(len(runs)), runs=runs), *cells))
-    header = (("", "arm"), ("", "n"), *((group, heading) for group, heading, _, _ in shown))
+    header = (("", "arm"), ("", "n"), *((group, heading) for group, heading, _ in shown))
     notes = [
         "means over the runs of an arm; train s: steps and pruning, without evaluation; whole command: from the import "
         "of torch to the pictures; a step: medians over the steps that records/phases.csv notes"
     ]
     return Grid("costs", "What each arm costs", header, tuple(rows), (*notes, *busy_variants(variants)))
-
-
-def _of(record: RunRecord, value: Callable[[CostRecord], float | None]) -> float | None:
-    costs = COSTS.find(record.folder)
-    return None if costs is None else value(costs)
-
-
-def _forward(costs: CostRecord) -> tuple[str, ...]:
-    """Returns the parts of a step's forward pass; effects have their own names."""
-    return ("scene", "splat", *costs.effects, "losses", "regularizers")
-
-
-def _step(costs: CostRecord, *parts: str) -> float | None:
-    found = [costs.step_ms[part] for part in parts if part in costs.step_ms]
-    return sum(found) if found else None
-
-
-def _mean(variant: Variant, value: Callable[[RunRecord], float | None]) -> float | None:
-    found = [number for record in variant.records if (number := value(record)) is not None]
-    return statistics.fmean(found) if found else None
 
 
 _HEADER = (
@@ -108,7 +89,7 @@ def effects_alike(variants: Sequence[Variant]) -> str | None:
 def _rows(variant: Variant) -> list[tuple[Cell, ...]]:
     plans = [{one.name: one for one in record.summary.run.effects} for record in variant.records]
     costs = [COSTS.find(record.folder) for record in variant.records]
-    runs = tuple(record.folder.name for record in variant.records)
+    runs = variant.run_names
     names = list(dict.fromkeys(name for plan in plans for name in plan))
     return [
         tuple(Cell(text, runs=runs) for text in (variant.title, *_cells(name, [plan[name] for plan in plans], costs)))
@@ -122,7 +103,7 @@ def _cells(name: str, found: Sequence[EffectDecision], costs: Sequence[CostRecor
     measured = [None if cost is None else cost.effects.get(name) for cost in costs]
     gains = [None if cost is None else cost.gains.get(name) for cost in costs]
     state = ("on" if on else "off") if on in (0, len(found)) else f"on in {on} of {len(found)}"
-    value = _mean_effects([one.value for one in found])
+    value = _mean([one.value for one in found])
     return [
         name,
         state,
@@ -147,12 +128,12 @@ def _gain(gains: Sequence[EffectGain | None], of: Callable[[EffectGain], float |
 
 
 def _text(values: Sequence[float | None], form: str) -> str:
-    mean = _mean_effects(values)
+    mean = _mean(values)
     return ABSENT if mean is None else form.format(mean)
 
 
-def _mean_effects(values: Sequence[float | None]) -> float | None:
-    given = [value for value in values if value is not None]
+def _mean(values: Iterable[float | None]) -> float | None:
+    given = [value for value in values if not pd.isna(value)]
     return statistics.fmean(given) if given else None
 
 
@@ -219,7 +200,7 @@ def time_to_quality(variants: Sequence[Variant]) -> Grid | None:
         plain = plain_of(variant, variants)
         if plain is None or not curves[variant.name]:
             continue
-        runs = tuple(record.folder.name for record in variant.records)
+        runs = variant.run_names
         times = [_reached(curves[variant.name], curves[plain.name], below) for below in BELOW]
         cells = [
             Cell(f"{time} {variant.busy('training') if ' s' in time else ''}".rstrip(), runs=runs) for time in times

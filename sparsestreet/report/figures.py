@@ -5,13 +5,14 @@ import re
 import statistics
 import textwrap
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any, TypeVar
 
 import matplotlib
+import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -24,9 +25,10 @@ from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.pictures.plots import count_curves, marks
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.curves import LEDGER
-from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.records.summary import HELD_OUT
 from sparsestreet.report.costs import curves_of, curves_of_runs, mean_curve
-from sparsestreet.report.variants import Unit, Value, Variant, by_scene, plain_of
+from sparsestreet.report.frame import by_scene
+from sparsestreet.report.variants import Variant, plain_of
 
 T = TypeVar("T")
 
@@ -57,13 +59,13 @@ _STYLE: dict[Any, Any] = {
 LEGEND = {"frameon": False, "labelcolor": _INK, "fontsize": 8}
 """Style of every legend."""
 
-PARETO_COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] = (
-    ("gaussians", "Gaussians", lambda run: float(run.gaussians_total)),
-    ("megabytes", "MB", lambda run: run.bytes_total / 1e6),
-    ("frame", "milliseconds a frame", lambda run: run.latency.p50),
-    ("training", "training minutes", lambda run: run.run.training_seconds and run.run.training_seconds / 60),
+PARETO_COSTS = (
+    ("gaussians", "Gaussians", "Gaussians"),
+    ("megabytes", "MB", "MB"),
+    ("frame", "milliseconds a frame", "ms/frame"),
+    ("training", "training minutes", "train minutes"),
 )
-"""Name, axis label and value of each cost that quality is drawn against."""
+"""Name, axis label and column of each cost that quality is drawn against."""
 
 
 def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, list[Axes]]:
@@ -202,7 +204,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return best
 
 
-def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
+def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str, str], path: Path) -> bool:
     """Draws quality of the full image, people and vehicles against one cost. Returns whether there was any to draw.
 
     Every run is a small mark, every variant's mean a large one, with an arrow from plain to pruned. The front is that
@@ -228,13 +230,11 @@ def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str
     return True
 
 
-def _held_out(metric: str) -> Value:
-    return lambda run: run.mean(metric, HELD_OUT)
+def _held_out(metric: str) -> str:
+    return f"{HELD_OUT} {metric}"
 
 
-def _pareto_panel(
-    axes: Axes, variants: Sequence[Variant], of: tuple[str, str, Value], quality: Value, region: str
-) -> Says:
+def _pareto_panel(axes: Axes, variants: Sequence[Variant], of: tuple[str, str, str], quality: str, region: str) -> Says:
     style = styles(variants)
     cost, unit = of[2], of[1]
     means: dict[str, tuple[float, float]] = {}
@@ -242,13 +242,13 @@ def _pareto_panel(
     for number, variant in enumerate(variants):
         paint, marker = _paint(style, variant), style[variant.name].marker
         points = _points(variant, cost, quality)
-        if not points:
+        if points.empty:
             continue
-        axes.scatter(*zip(*points.values(), strict=True), s=9, alpha=0.45, color=paint, marker=marker,
+        axes.scatter(points["cost"], points["quality"], s=9, alpha=0.45, color=paint, marker=marker,
                      linewidths=0.8, gid=(runs := f"{region} {number} runs"))  # fmt: skip
         means[variant.name] = _mean_point(points)
         says[runs] = [f"{variant.name}, {scene}, seed {seed}: {_in_words(point, unit)}"
-                      for ((scene, _), seed), point in points.items()]  # fmt: skip
+                      for (scene, _, seed), *point in points.itertuples()]  # fmt: skip
         says[f"{region} {number} mean"] = [f"{variant.title}, mean: {_in_words(means[variant.name], unit)}"]
         # A marker of lines has no inside to leave empty: it is drawn thin.
         hollow = {"facecolors": "none", "edgecolors": paint} if marker not in "x+" else {"color": paint}
@@ -291,13 +291,13 @@ def legend_below(figure: Figure, handles: Sequence[Artist]) -> None:
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, **LEGEND)
 
 
-def _in_words(point: tuple[float, float], unit: str) -> str:
+def _in_words(point: Sequence[float], unit: str) -> str:
     cost = f"{point[0]:,.0f}" if point[0] >= 1000 else f"{point[0]:.4g}"
     return f"{point[1]:.3f} dB, {cost} {unit}"
 
 
 def paired_means(
-    variant: Variant, plain: Variant | None, cost: Value, quality: Value
+    variant: Variant, plain: Variant | None, cost: str, quality: str
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
     """Returns where an arrow starts and ends: the means of the plain variant and of a variant over the units of both.
 
@@ -306,23 +306,19 @@ def paired_means(
     if plain is None or plain is variant:
         return None
     ours, theirs = _points(variant, cost, quality), _points(plain, cost, quality)
-    shared = ours.keys() & theirs.keys()
-    if not shared:
-        return None
-    start, end = (_mean_point({unit: points[unit] for unit in shared}) for points in (theirs, ours))
-    return start, end
+    shared = ours.index.intersection(theirs.index)
+    return None if shared.empty else (_mean_point(theirs.loc[shared]), _mean_point(ours.loc[shared]))
 
 
-def _points(variant: Variant, cost: Value, quality: Value) -> dict[Unit, tuple[float, float]]:
-    """Returns scene and seed -> cost and quality, where both are known."""
-    costs, qualities = variant.units(cost), variant.units(quality)
-    return {unit: (costs[unit], qualities[unit]) for unit in sorted(costs.keys() & qualities.keys())}
+def _points(variant: Variant, cost: str, quality: str) -> pd.DataFrame:
+    """Return scene, clip and seed -> cost and quality, where both are known."""
+    both = {"cost": variant.units(cost), "quality": variant.units(quality)}
+    return pd.concat(both, axis=1, join="inner").sort_index()
 
 
-def _mean_point(points: Mapping[Unit, tuple[float, float]]) -> tuple[float, float]:
-    """Returns the mean over scenes of the mean over each scene's seeds."""
-    scenes = (by_scene({unit: point[axis] for unit, point in points.items()}) for axis in (0, 1))
-    x, y = (statistics.fmean(means.values()) for means in scenes)
+def _mean_point(points: pd.DataFrame) -> tuple[float, float]:
+    """Return the mean over scenes of the mean over each scene's seeds."""
+    x, y = (statistics.fmean(by_scene(points[axis])) for axis in ("cost", "quality"))
     return x, y
 
 
@@ -473,7 +469,7 @@ def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
     legend_below(figure, list(once.values()))
 
 
-_DASHES_FIGURES_README = {"plain": "-", "paper": "--", "paper_short": "--", "removal": ":"}
+_DASHES_OF_KIND = {"plain": "-", "paper": "--", "paper_short": "--", "removal": ":"}
 
 
 def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> None:
@@ -482,13 +478,15 @@ def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> 
     Curves are means over scenes and seeds at each look. Without curves, only the end of training is drawn. Raises
     ValueError if no run has a held-out PSNR.
     """
-    shown = [variant for variant in variants if not variant.control and variant.mean(_psnr(protocol)) is not None]
+    shown = [
+        variant for variant in variants if not variant.control and variant.mean(_held_out(protocol.psnr)) is not None
+    ]
     if not shown:
         raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
     figure, (training, frame) = panels(2, width=4.6, height=4.0)
     for variant in shown:
         _over_training(training, variant, shown, protocol)
-        _points_figures_readme(frame, variant, shown, lambda run: run.latency.p50, protocol)
+        _draw_points(frame, variant, shown, "ms/frame", protocol)
     training.set_xlabel("training seconds")
     frame.set_xlabel("milliseconds a frame")
     training.set_ylabel("held-out PSNR, dB")
@@ -498,51 +496,39 @@ def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> 
     figure.savefig(path, dpi=150, facecolor="white", metadata={"Software": None})
 
 
-def _psnr(protocol: Protocol) -> Value:
-    return lambda run: run.mean(protocol.psnr, HELD_OUT)
-
-
 def _over_training(axes: Axes, variant: Variant, shown: Sequence[Variant], protocol: Protocol) -> None:
     curves = list(curves_of(variant).values())
     if not curves:
-        _points_figures_readme(axes, variant, shown, _seconds, protocol)
+        _draw_points(axes, variant, shown, "train s", protocol)
         return
     mean = mean_curve(curves)
     look, end = styles(shown)[variant.name], [len(mean.seconds) - 1]
-    dashes = _DASHES_FIGURES_README.get(look.kind, "-.")
-    paint = _paint_figures_readme(variant, shown)
+    dashes = _DASHES_OF_KIND.get(look.kind, "-.")
+    paint = _paint_among(variant, shown)
     axes.plot(
         mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(variant)
     )
 
 
-def _paint_figures_readme(variant: Variant, shown: Sequence[Variant]) -> str:
+def _paint_among(variant: Variant, shown: Sequence[Variant]) -> str:
     """Returns the color of the variant's method, or of its sparsification if there is only one method."""
     look = styles(shown)
     own = look[variant.name]
     return own.method if len({one.method for one in look.values()}) > 1 else own.color
 
 
-def _points_figures_readme(
-    axes: Axes, variant: Variant, shown: Sequence[Variant], cost: Value, protocol: Protocol
-) -> None:
-    """Draws the mean, and every run small and pale."""
-    costs, qualities = variant.units(cost), variant.units(_psnr(protocol))
-    units = sorted(costs.keys() & qualities.keys())
-    if not units:
+def _draw_points(axes: Axes, variant: Variant, shown: Sequence[Variant], cost: str, protocol: Protocol) -> None:
+    """Draw the mean, and every run small and pale."""
+    points = _points(variant, cost, _held_out(protocol.psnr))
+    if points.empty:
         return
-    paint = _paint_figures_readme(variant, shown)
-    axes.scatter([costs[unit] for unit in units], [qualities[unit] for unit in units], s=8, color=paint, alpha=0.5)
-    scenes = (by_scene({unit: values[unit] for unit in units}) for values in (costs, qualities))
-    x, y = (statistics.fmean(means.values()) for means in scenes)
-    axes.scatter(x, y, s=44, color=paint, marker=styles(shown)[variant.name].marker, label=_label(variant), zorder=3)
+    paint = _paint_among(variant, shown)
+    axes.scatter(points["cost"], points["quality"], s=8, color=paint, alpha=0.5)
+    marker = styles(shown)[variant.name].marker
+    axes.scatter(*_mean_point(points), s=44, color=paint, marker=marker, label=_label(variant), zorder=3)
 
 
 def _label(variant: Variant) -> str:
     return (
         f"{variant.title} (machine not quiet)" if variant.busy("frames") or variant.busy("training") else variant.title
     )
-
-
-def _seconds(run: RunSummary) -> float | None:
-    return run.run.training_seconds

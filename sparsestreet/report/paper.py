@@ -11,9 +11,8 @@ from pathlib import Path
 from sparsestreet.metrics.protocols import Protocol
 from sparsestreet.records.run import FailedRun
 from sparsestreet.records.summary import HELD_OUT, TRAINING
-from sparsestreet.report.novel_views import mean_beside
 from sparsestreet.report.tables import ABSENT, Cell, Grid
-from sparsestreet.report.variants import Value, Variant, busy_variants
+from sparsestreet.report.variants import Variant, busy_variants
 
 Key = tuple[str, str, str]
 """Views ("training", "held_out", "novel", ""), region and quantity of a column."""
@@ -217,7 +216,7 @@ def _row(
     title: str, variant: Variant | None, table: PublishedTable, row: PublishedRow | None, protocol: Protocol
 ) -> tuple[Cell, ...]:
     published = table.values(row) if row else {}
-    runs = tuple(record.folder.name for record in variant.records) if variant else ()
+    runs = variant.run_names if variant else ()
     cells = [Cell(title, runs=runs), Cell(str(len(runs)) if variant else ABSENT, runs=runs)]
     for key in table.columns:
         ours = _ours(variant, key, protocol) if variant else None
@@ -229,29 +228,24 @@ def _row(
 
 
 def _ours(variant: Variant, key: Key, protocol: Protocol) -> float | None:
-    views = key[0]
-    if views == "novel":
-        return mean_beside(variant, float(key[1].split()[0]), key[2])
-    value = _value(key, protocol)
-    if value is None:
+    column = _column(key, protocol)
+    if column is None:
         return None
-    if views == TRAINING:
-        # As in DriveStudio, prefer runs that were trained on all views.
-        whole = variant.mean(value, whole=True)
-        return variant.mean(value) if whole is None else whole
-    mean = variant.mean(value)
-    return variant.mean(value, whole=True) if mean is None and views == "" else mean
+    held, whole = variant.mean(column), variant.mean(column, whole=True)
+    if key[0] == TRAINING:  # as in DriveStudio, of the runs that were trained on all views where there are any
+        return held if whole is None else whole
+    return whole if held is None and key[0] in ("", "novel") else held
 
 
-def _value(key: Key, protocol: Protocol) -> Value | None:
-    """Returns the function that reads a column's number from a record; None if no record holds it."""
+def _column(key: Key, protocol: Protocol) -> str | None:
+    """Return the column of ``run_frame`` that the paper's column shows; None if no record holds it."""
     views, region, quantity = key
-    if quantity == "gaussians":
-        return lambda run: float(run.gaussians_total)
-    if quantity == "fps":
-        return lambda run: 1000 / run.latency.p50
+    if views == "novel":
+        return f"{quantity} at {region}"
+    if quantity in ("gaussians", "fps"):
+        return {"gaussians": "Gaussians", "fps": "FPS"}[quantity]
     metric = metric_id(protocol, region, quantity)
-    return None if metric is None else lambda run: run.mean(metric, views)
+    return None if metric is None else f"{views} {metric}"
 
 
 def metric_id(protocol: Protocol, region: str, quantity: str) -> str | None:

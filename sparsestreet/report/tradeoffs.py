@@ -3,12 +3,14 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import pandas as pd
+
 from sparsestreet.metrics.protocols import Protocol
-from sparsestreet.records.summary import HELD_OUT, RunSummary
+from sparsestreet.records.summary import HELD_OUT
+from sparsestreet.report.frame import by_scene, mean_over_scenes
 from sparsestreet.report.tables import (
     BUSY,
     CAPPED,
-    CLOCKS,
     CONFIDENCE,
     Cell,
     ConfidenceInterval,
@@ -16,7 +18,7 @@ from sparsestreet.report.tables import (
     number_cell,
     t_interval,
 )
-from sparsestreet.report.variants import Unit, Value, Variant, busy_variants, by_scene, mean_over_scenes, plain_of
+from sparsestreet.report.variants import Variant, busy_variants, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
 """Losses of full-image held-out PSNR, dB, that a smaller variant may have."""
@@ -29,16 +31,13 @@ class Measure:
     """A column of differences."""
 
     heading: str
-    value: Value
+    column: str
+    """Of ``run_frame``."""
     text: str
     relative: bool
     """Whether the difference is in per cent of the plain run's value."""
     clock: str = ""
     """What is timed, a key of ``CLOCKS``; empty: no time."""
-
-    def steady(self, run: RunSummary) -> float | None:
-        """Returns the value of a run, or None for a time of a machine that was not quiet."""
-        return self.value(run) if not self.clock or CLOCKS[self.clock](run) else None
 
 
 def measures(protocol: Protocol) -> tuple[Measure, ...]:
@@ -52,41 +51,38 @@ def measures(protocol: Protocol) -> tuple[Measure, ...]:
     )
     return (
         *(Measure(heading, _held_out(metric), text, False) for heading, metric, text in quality),
-        Measure("Gaussians", lambda run: float(run.gaussians_total), "{:+.1f}", True),
-        Measure("MB", lambda run: run.bytes_total / 1e6, "{:+.1f}", True),
-        Measure("ms/frame", lambda run: run.latency.p50, "{:+.1f}", True, "frames"),
-        Measure("train s", lambda run: run.run.training_seconds, "{:+.1f}", True, "training"),
+        Measure("Gaussians", "Gaussians", "{:+.1f}", True),
+        Measure("MB", "MB", "{:+.1f}", True),
+        Measure("ms/frame", "ms/frame", "{:+.1f}", True, "frames"),
+        Measure("train s", "train s", "{:+.1f}", True, "training"),
     )
 
 
-def _held_out(metric: str) -> Value:
-    return lambda run: run.mean(metric, HELD_OUT)
+def _held_out(metric: str) -> str:
+    return f"{HELD_OUT} {metric}"
 
 
-def paired(variant: Variant, plain: Variant, value: Value, relative: bool = False) -> ConfidenceInterval | None:
-    """Returns the difference to the plain variant over the pairs of scene and seed that both variants have."""
-    ours, theirs = variant.units(value), plain.units(value)
-    differences = {
-        unit: 100 * (ours[unit] / theirs[unit] - 1) if relative else ours[unit] - theirs[unit]
-        for unit in ours.keys() & theirs.keys()
-        if not relative or theirs[unit]
-    }
-    return interval_over_scenes(differences)
+def paired(
+    variant: Variant, plain: Variant, column: str, relative: bool = False, clock: str = ""
+) -> ConfidenceInterval | None:
+    """Return the difference to the plain variant over the pairs of scene and seed that both have.
 
-
-def interval_over_scenes(values: dict[Unit, float]) -> ConfidenceInterval | None:
-    """Returns the t interval over scenes, each with the mean of its seeds; over the seeds of a single scene.
-
-    >>> interval_over_scenes({(("street", ""), 0): 0.1, (("street", ""), 1): 0.3, (("park", ""), 0): 0.4}).n
-    2
+    ``relative``: in per cent of the plain variant's number. With a ``clock``, runs of a busy machine are left out.
     """
-    scenes = by_scene(values)
-    return t_interval(list((scenes if len(scenes) > 1 else values).values()))
+    ours, theirs = variant.units(column, clock=clock), plain.units(column, clock=clock)
+    differences = 100 * (ours / theirs[theirs != 0] - 1) if relative else ours - theirs
+    return interval_over_scenes(differences.dropna())
+
+
+def interval_over_scenes(units: pd.Series) -> ConfidenceInterval | None:
+    """Return the t interval over scenes, each with the mean of its seeds; over the seeds of a single scene."""
+    scenes = by_scene(units)
+    return t_interval((scenes if len(scenes) > 1 else units).tolist())
 
 
 def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
     """Returns the table that compares every variant with the plain variant of its method at the same place."""
-    shown = [one for one in measures(protocol) if any(variant.mean(one.value) is not None for variant in variants)]
+    shown = [one for one in measures(protocol) if any(variant.mean(one.column) is not None for variant in variants)]
     rows, alone = [], []
     for variant in variants:
         plain = plain_of(variant, variants)
@@ -95,8 +91,8 @@ def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
         if plain is None:
             alone.append(variant.name)
             continue
-        runs = tuple(record.folder.name for one in (variant, plain) for record in one.records)
-        found = [paired(variant, plain, one.steady, one.relative) for one in shown]
+        runs = variant.run_names + plain.run_names
+        found = [paired(variant, plain, one.column, one.relative, one.clock) for one in shown]
         n = max((interval.n for interval in found if interval), default=0)
         cells = [
             Cell(BUSY, runs=runs)
@@ -170,7 +166,7 @@ def _candidates(plain: Variant, variants: Sequence[Variant], protocol: Protocol)
         if plain_of(variant, variants) is not plain:
             continue
         loss = paired(variant, plain, _held_out(protocol.psnr))
-        share = paired(variant, plain, lambda run: float(run.gaussians_total), relative=True)
+        share = paired(variant, plain, "Gaussians", relative=True)
         if loss is not None and share is not None:
             found.append(_Candidate(variant, plain, -loss.mean, 1 + share.mean / 100))
     return found
@@ -228,26 +224,22 @@ def _in_words(one: _Candidate) -> str:
 def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
     if best is None:
         return (Cell("none of this sweep"), *[Cell()] * (len(_CHOSEN) - 2))
-    runs = tuple(record.folder.name for record in best.variant.records)
+    runs = best.variant.run_names
 
-    def mean(value: Value, form: str, clock: str = "") -> Cell:
-        ours, theirs = best.variant.units(value), best.plain.units(value)
-        found = mean_over_scenes({unit: ours[unit] for unit in ours.keys() & theirs.keys()})
+    def mean(column: str, form: str, clock: str = "") -> Cell:
+        ours, theirs = best.variant.units(column), best.plain.units(column)
+        found = mean_over_scenes(ours[ours.index.isin(theirs.index)])
         return number_cell(found, form, runs, best.variant.busy(clock) if clock else "")
 
     numbers = (
         number_cell(-best.loss, "{:+.2f}", runs),
         number_cell(100 * best.share, "{:.0f}", runs),
-        mean(lambda run: float(run.gaussians_total), "{:,.0f}"),
-        mean(lambda run: run.bytes_total / 1e6, "{:.2f}"),
-        mean(lambda run: run.latency.p50, "{:.2f}", "frames"),
-        mean(_minutes, "{:.2f}", "training"),
+        mean("Gaussians", "{:,.0f}"),
+        mean("MB", "{:.2f}"),
+        mean("ms/frame", "{:.2f}", "frames"),
+        mean("train minutes", "{:.2f}", "training"),
     )
     return (Cell(best.variant.title, runs=runs), *numbers)
-
-
-def _minutes(run: RunSummary) -> float | None:
-    return None if run.run.training_seconds is None else run.run.training_seconds / 60
 
 
 LOSS = 0.3
@@ -300,8 +292,8 @@ def summary_line(variants: Sequence[Variant], protocol: Protocol) -> tuple[str, 
 def _compared(variant: Variant, plain: Variant, protocol: Protocol) -> _Compared | None:
     if variant is plain or variant.control:
         return None
-    gain = paired(variant, plain, lambda run: run.mean(protocol.psnr, HELD_OUT))
-    share = paired(variant, plain, lambda run: float(run.gaussians_total), relative=True)
+    gain = paired(variant, plain, _held_out(protocol.psnr))
+    share = paired(variant, plain, "Gaussians", relative=True)
     if gain is None or share is None or gain.n < MIN_PAIRS:
         return None
     return _Compared(variant, gain, 100 + share.mean)

@@ -1,9 +1,11 @@
 """The variants of a sweep: runs that may be averaged, their names, and the plain variant of each."""
 
-import statistics
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+
+import pandas as pd
 
 from sparsestreet.records.configuration import (
     IDENTITY_KEYS,
@@ -18,14 +20,13 @@ from sparsestreet.records.configuration import (
 )
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.collect import RunRecord
+from sparsestreet.report.frame import CLIP_KEYS, by_unit, clip_of, mean_over_scenes, run_frame
 from sparsestreet.report.tables import BUSY, CLOCKS, busy_note
 
 LOG_KEYS = ("data.log.*",)
 SECTION_KEYS = ("split.*", *LOG_KEYS)
 """Options that determine the images a run is measured on. They put runs into different tables, not columns."""
 
-CLIP_KEYS = ("data.log.first_frame", "data.log.last_frame")
-"""Options that select a part of a log. Runs that differ in them have different scenes, as runs of different logs do."""
 
 _EARLIER_CONTROLS = {
     "random": "as many Gaussians, drawn at random",
@@ -187,8 +188,6 @@ def _shortened(word: str) -> str:
     return short if len(short) <= _MAX_CHARACTERS else f"{short[:_MAX_CHARACTERS]}..."
 
 
-Value = Callable[[RunSummary], float | None]
-RecordValue = Callable[[RunRecord], float | None]
 Unit = tuple[tuple[str, str], int]
 """A scene with the part of its log, and a seed."""
 
@@ -235,25 +234,31 @@ class Variant:
         found: dict[Unit, list[RunRecord]] = {}
         for record in self.records:
             if (record.summary.run.split == "none") == whole:
-                found.setdefault(unit_of(record.summary), []).append(record)
+                found.setdefault((clip_of(record.summary), record.summary.run.seed), []).append(record)
         return found
 
-    def units(self, value: Value, whole: bool = False) -> dict[Unit, float]:
-        """Returns scene and seed -> the value of its run, or the mean of several runs.
+    @cached_property
+    def frame(self) -> pd.DataFrame:
+        """The numbers of its runs; see ``run_frame``."""
+        return run_frame(self.records)
 
-        ``whole`` selects the runs that were trained on all views; otherwise the other runs count.
+    @property
+    def run_names(self) -> tuple[str, ...]:
+        """The names of the folders of its runs."""
+        return tuple(record.folder.name for record in self.records)
+
+    def units(self, column: str, whole: bool = False, clock: str = "") -> pd.Series:
+        """Return scene, clip and seed -> the number of its run, or the mean of several runs.
+
+        ``whole`` selects the runs that were trained on all views; otherwise the other runs count. With a ``clock``
+        ("frames", "training") only runs count that were timed on a quiet machine.
         """
-        return self.units_of_records(lambda record: value(record.summary), whole)
+        rows = self.frame["whole"] == whole
+        return by_unit(self.frame[rows & self.frame[clock] if clock else rows], column)
 
-    def units_of_records(self, value: RecordValue, whole: bool = False) -> dict[Unit, float]:
-        """Does the same as ``units`` for a value that may be in another file of a run's folder."""
-        found = {unit: [value(record) for record in records] for unit, records in self.runs(whole).items()}
-        known = {unit: [number for number in numbers if number is not None] for unit, numbers in found.items()}
-        return {unit: statistics.fmean(numbers) for unit, numbers in known.items() if numbers}
-
-    def mean(self, value: Value, whole: bool = False) -> float | None:
-        """Returns the mean over scenes of the mean over each scene's seeds; None if no run has the value."""
-        return mean_over_scenes(self.units(value, whole))
+    def mean(self, column: str, whole: bool = False) -> float | None:
+        """Return the mean over scenes of the mean over each scene's seeds; None if no run has the number."""
+        return mean_over_scenes(self.units(column, whole))
 
     def busy(self, clock: str) -> str:
         """Returns the mark of times, of "frames" or of "training", if a machine was not quiet; else an empty text."""
@@ -263,33 +268,6 @@ class Variant:
 def busy_variants(found: Iterable[Variant]) -> list[str]:
     """Returns a note that names the variants with times of a machine that was not quiet, or nothing."""
     return busy_note((variant.name, record.summary) for variant in found for record in variant.records)
-
-
-def unit_of(run: RunSummary) -> Unit:
-    """Returns the key by which runs of two variants are paired."""
-    return (run.run.scene, config_hash(only(run.run.config, CLIP_KEYS))), run.run.seed
-
-
-def mean_over_scenes(units: dict[Unit, float]) -> float | None:
-    """Returns the mean in which each scene counts once; None without values.
-
-    >>> mean_over_scenes({(("street", ""), 0): 1.0, (("street", ""), 1): 3.0, (("park", ""), 0): 6.0})
-    4.0
-    """
-    values = list(by_scene(units).values())
-    return statistics.fmean(values) if values else None
-
-
-def by_scene(units: dict[Unit, float]) -> dict[tuple[str, str], float]:
-    """Returns scene -> mean over its seeds.
-
-    >>> by_scene({(("street", ""), 0): 1.0, (("street", ""), 1): 3.0})
-    {('street', ''): 2.0}
-    """
-    scenes: dict[tuple[str, str], list[float]] = {}
-    for (scene, _), value in units.items():
-        scenes.setdefault(scene, []).append(value)
-    return {scene: statistics.fmean(values) for scene, values in scenes.items()}
 
 
 def variants(records: Sequence[RunRecord]) -> list[Variant]:
@@ -403,5 +381,5 @@ def _splits_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
 
 def _edition(run: RunSummary, records: Sequence[RunRecord]) -> str:
     """Returns the start of the data's hash if runs of the scene have different data; else an empty text."""
-    alike = {record.summary.run.data_hash for record in records if unit_of(record.summary)[0] == unit_of(run)[0]}
+    alike = {record.summary.run.data_hash for record in records if clip_of(record.summary) == clip_of(run)}
     return f"data {run.run.data_hash[:6]}" if len(alike) > 1 else ""

@@ -10,7 +10,8 @@ from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
 from sparsestreet.records.renders import NOVEL, PRESETS, PresetRecord, RenderedAs
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report.collect import collect
-from sparsestreet.report.novel_views import TRUTH, beside_the_path, rendered_otherwise, shifts_of
+from sparsestreet.report.frame import shifts_of
+from sparsestreet.report.novel_views import TRUTH, beside_the_path, rendered_otherwise
 from sparsestreet.report.paper import paper_table
 from sparsestreet.report.variants import variants
 from tests.evaluation.frames import NOISE, make_summary
@@ -72,7 +73,8 @@ def test_table_4_holds_the_inception_distance_alone(tmp_path):
     grid = paper_table([variant], [], DRIVESTUDIO, "table4_novel")
     assert [cell.text for cell in grid.rows[0]] == ["omnire", "1", "42.00", "43.62", "-", "61.56", "-", "75.14"]
     write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0}, name="frechet_alexnet")
-    assert paper_table([variant], [], DRIVESTUDIO, "table4_novel").rows[0][2].text == "-"
+    again = variants([record(summary, str(tmp_path))])
+    assert paper_table(again, [], DRIVESTUDIO, "table4_novel").rows[0][2].text == "-"
 
 
 def test_none_recorded_no_table(tmp_path):

@@ -8,6 +8,7 @@ from scipy import stats
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.protocols import DRIVESTUDIO, STRICT
 from sparsestreet.records.summary import HELD_OUT, MetricSummary
+from sparsestreet.report.frame import run_frame
 from sparsestreet.report.tables import t_interval
 from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired, summary_line
 from sparsestreet.report.variants import variants
@@ -26,7 +27,7 @@ def by_heading(grid, row):
 
 def test_pairs_are_of_a_scene_and_a_seed(found):
     plain, removal, _ = found
-    loss = paired(removal, plain, lambda run: run.mean("psnr_full"))
+    loss = paired(removal, plain, "held_out psnr_full")
     # -0.2, -0.3, -0.4: t(2) = 4.303, sd 0.1
     assert loss.mean == pytest.approx(-0.3)
     assert loss.high - loss.mean == pytest.approx(4.303 * 0.1 / 3**0.5, abs=1e-3)
@@ -39,10 +40,10 @@ def test_seeds_of_one_scene_are_the_pairs_else_scenes_are():
     }  # fmt: skip
     records = [record(make_summary(label, seed, value, scene=scene)) for (label, scene, seed), value in runs.items()]
     plain, removal = variants(records)
-    both = paired(removal, plain, lambda run: run.mean("psnr_full"))
+    both = paired(removal, plain, "held_out psnr_full")
     assert (both.mean, both.n) == (pytest.approx(-1.25), 2)  # scene a: -1.5, scene b: -1
     plain, removal = variants([one for one in records if one.summary.run.scene == "a"])
-    alone = paired(removal, plain, lambda run: run.mean("psnr_full"))
+    alone = paired(removal, plain, "held_out psnr_full")
     assert (alone.mean, alone.n) == (pytest.approx(-1.5), 2)
 
 
@@ -166,7 +167,8 @@ def test_every_column_has_a_difference_of_its_own(protocol):
     }
     assert {cell.runs for cell in row.values()} == {("r", "p")}
     # Which metric a column holds: the plain run's own number.
-    values = {one.heading: one.value(plain) for one in measures(protocol)}
+    (numbers,) = run_frame([record(plain)]).to_dict("records")
+    values = {one.heading: numbers[one.column] for one in measures(protocol)}
     wanted = (protocol.psnr, protocol.human[0], protocol.vehicle[0], protocol.ssim, *protocol.lpips)
     assert [values[name] for name in list(values)[: len(wanted)]] == [plain.mean(name) for name in wanted]
     assert [values[name] for name in ("Gaussians", "MB", "ms/frame", "train s")] == [1000.0, 0.236, 40.0, 200.0]
