@@ -1,10 +1,9 @@
 """What each variant costs: size, time and memory, its effects, and the seconds to a quality."""
 
+import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-
-import pandas as pd
 
 from sparsestreet.records.costs import COSTS, CostRecord, EffectGain
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
@@ -32,7 +31,10 @@ _COLUMNS = (
 def what_variants_cost(variants: Sequence[Variant]) -> Grid:
     """Return size, speed, time and memory of every variant, as means over its runs."""
     names = [heading for _, heading, _ in _COLUMNS]
-    means = {variant.name: {name: _mean(variant.frame.get(name, ())) for name in names} for variant in variants}
+    means = {
+        variant.name: {name: _mean(numbers) for name, numbers in variant.frame.reindex(columns=names).items()}
+        for variant in variants
+    }
     shown = [column for column in _COLUMNS if any(one[column[1]] is not None for one in means.values())]
     rows = []
     for variant in variants:
@@ -133,7 +135,7 @@ def _text(values: Sequence[float | None], form: str) -> str:
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
-    given = [value for value in values if not pd.isna(value)]
+    given = [value for value in values if value is not None and not math.isnan(value)]
     return statistics.fmean(given) if given else None
 
 

@@ -318,7 +318,7 @@ def _points(variant: Variant, cost: str, quality: str) -> pd.DataFrame:
 
 def _mean_point(points: pd.DataFrame) -> tuple[float, float]:
     """Return the mean over scenes of the mean over each scene's seeds."""
-    x, y = (statistics.fmean(by_scene(points[axis])) for axis in ("cost", "quality"))
+    x, y = (statistics.fmean(by_scene(pd.Series(points[axis]))) for axis in ("cost", "quality"))
     return x, y
 
 

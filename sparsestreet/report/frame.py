@@ -105,7 +105,7 @@ def by_unit(frame: pd.DataFrame, column: str) -> pd.Series:
     """
     known = frame.reindex(columns=[*UNIT, column]).dropna()
     # The exact mean: a sum in floats would move numbers across the limits that tables are cut by.
-    return _means(known.set_index(UNIT)[column].astype(float), UNIT)
+    return _means(pd.Series(known.set_index(UNIT)[column], dtype=float), UNIT)
 
 
 def by_scene(units: pd.Series) -> pd.Series:
@@ -120,4 +120,4 @@ def mean_over_scenes(units: pd.Series) -> float | None:
 
 
 def _means(values: pd.Series, levels: list[str]) -> pd.Series:
-    return values if values.empty else values.groupby(level=levels, sort=False).agg(statistics.fmean)
+    return values if values.empty else pd.Series(values.groupby(level=levels, sort=False).agg(statistics.fmean))

@@ -81,27 +81,28 @@ def rendered_otherwise(variants: Sequence[Variant], protocol: Protocol) -> Grid 
 def _renders(variant: Variant) -> pd.DataFrame:
     """Return a row for each way in which runs that hold views out were rendered; else of runs trained on all views."""
     rows = []
-    for folder, run in zip(
-        (record.folder for record in variant.records), variant.frame.to_dict("records"), strict=True
-    ):
-        found = PRESETS.find(folder)
-        for one in () if found is None else found.rendered:
-            own = {"preset": one.preset, "trained": one.trained, "quiet": found.noise.quiet}
+    for record, run in zip(variant.records, variant.frame.to_dict("records"), strict=True):
+        found = PRESETS.find(record.folder)
+        rendered, quiet = (found.rendered, found.noise.quiet) if found else ((), True)
+        for one in rendered:
+            own = {"preset": one.preset, "trained": one.trained, "quiet": quiet}
             numbers = {"dB to exact": one.psnr_to_exact, "ms/frame": one.frame_ms}
             rows.append({name: run[name] for name in (*UNIT, "whole")} | own | numbers | one.quality)
     renders = pd.DataFrame(rows, columns=None if rows else [*UNIT, "whole", "preset", "trained", "quiet"])
-    return renders if renders["whole"].all() else renders[~renders["whole"].astype(bool)]
+    held = renders.loc[~renders["whole"].astype(bool)]
+    return renders if held.empty else held
 
 
 def _rows(variant: Variant, renders: pd.DataFrame, protocol: Protocol, several: bool) -> Iterator[tuple[Cell, ...]]:
     """Yield a row for each preset; the preset of training tells ``several`` variants of a label apart."""
     runs = variant.run_names
-    trained = renders[renders["trained"].astype(bool)]
-    presets = trained["preset"].unique()
+    trained = renders.loc[renders["trained"].astype(bool)]
+    presets = sorted(set(trained["preset"]))
     title = f"{variant.label}, {presets[0]}" if several and len(presets) == 1 else variant.title
-    for preset, found in renders.groupby("preset", sort=False):
+    for preset in dict.fromkeys(renders["preset"]):
+        found = renders.loc[renders["preset"] == preset]
         n = found.groupby(UNIT).ngroups
-        name = f"{preset}, as trained" if found["trained"].all() else str(preset)
+        name = f"{preset}, as trained" if all(found["trained"]) else preset
         cells = [Cell(title, runs=runs), Cell(name, runs=runs), Cell(str(n), runs=runs)]
         for metric in (protocol.psnr, protocol.human[0], protocol.vehicle[0]):
             ours, theirs = by_unit(found, metric), by_unit(trained, metric)
@@ -116,4 +117,4 @@ def _rows(variant: Variant, renders: pd.DataFrame, protocol: Protocol, several: 
 
 def _busy(renders: pd.DataFrame) -> str:
     """Return the mark of milliseconds if a machine was not quiet; else an empty text."""
-    return "" if renders["quiet"].all() else BUSY
+    return "" if all(renders["quiet"]) else BUSY

@@ -228,7 +228,7 @@ def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
 
     def mean(column: str, form: str, clock: str = "") -> Cell:
         ours, theirs = best.variant.units(column), best.plain.units(column)
-        found = mean_over_scenes(ours[ours.index.isin(theirs.index)])
+        found = mean_over_scenes(ours.reindex(ours.index.intersection(theirs.index)))
         return number_cell(found, form, runs, best.variant.busy(clock) if clock else "")
 
     numbers = (

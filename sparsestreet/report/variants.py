@@ -254,7 +254,7 @@ class Variant:
         ("frames", "training") only runs count that were timed on a quiet machine.
         """
         rows = self.frame["whole"] == whole
-        return by_unit(self.frame[rows & self.frame[clock] if clock else rows], column)
+        return by_unit(self.frame.loc[rows & self.frame[clock] if clock else rows], column)
 
     def mean(self, column: str, whole: bool = False) -> float | None:
         """Return the mean over scenes of the mean over each scene's seeds; None if no run has the number."""

@@ -1,6 +1,7 @@
 """Tables from hand-made records, against numbers worked out by hand."""
 
 import dataclasses
+import io
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.sections import section_tables, sections, sections_markdown, size_figure
 from sparsestreet.report.tables import Spread, spread
 from tests.evaluation.frames import disturbed, make_summary
+from tests.report.sweep_folder import record
 from tests.typed import as_a
 
 
@@ -463,3 +465,15 @@ def test_a_protocol_chooses_the_columns():
         }
         assert found["near PSNR"] == values["psnr_near_lidar"]
     assert "LPIPS vgg" not in shown(summary, DRIVESTUDIO)
+
+
+def test_brackets_of_a_label_are_no_markup():
+    """A label comes from outside: ``[red]`` stands in the terminal as it is written, and colors nothing."""
+    runs = [record(make_summary("[red]mine", scene="[/b]street")), record(make_summary("[bold]x", scene="[/b]street"))]
+    out = io.StringIO()
+    console = Console(file=out, width=200, force_terminal=True, color_system="standard")
+    for part in section_tables(sections(runs), 200):
+        console.print(part)
+    text = out.getvalue()
+    assert all(word in text for word in ("[red]mine", "[bold]x", "[/b]street"))
+    assert "\x1b[31m" not in text
