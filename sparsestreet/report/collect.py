@@ -20,9 +20,6 @@ class RunRecord:
 def collect(roots: Iterable[Path]) -> list[RunRecord]:
     """Returns every run below the given folders once, sorted by path.
 
-    A run that a second sweep took from a first one counts as that of the first, where both are below the folders and
-    call it the same: it is no repeat.
-
     Raises FileNotFoundError for a root without records, RecordError (naming the file) for a malformed one.
     """
     folders: set[Path] = set()

@@ -1,43 +1,16 @@
 """The notes below a table: how its numbers are defined, and where runs differ."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 
 from sparsestreet.metrics.definitions import LIDAR_REACH, Protocol
-from sparsestreet.records.quality import TRAINING
 from sparsestreet.records.run import CodeVersion, Machine
-from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.variants import Variant
-
-CAPPED = "†"
-"""Marks counts that a node's ``max_gaussians`` limited."""
-BUSY = "§"
-"""Marks times that are of a machine that was not quiet, as the ``noise`` of their record says."""
+from sparsestreet.records.summary import TRAINING, RunSummary
+from sparsestreet.report.tables import CAPPED, busy_note
+from sparsestreet.report.variants import Repeats
 
 
-def frames_steady(run: RunSummary) -> bool:
-    """Return whether the machine was quiet while frames were timed."""
-    return run.latency.noise.quiet
-
-
-def training_steady(run: RunSummary) -> bool:
-    """Return whether the machine was quiet while the run trained; a record that does not say counts as quiet."""
-    return run.run.noise is None or run.run.noise.quiet
-
-
-CLOCKS: dict[str, Callable[[RunSummary], bool]] = {"frames": frames_steady, "training": training_steady}
-"""What is timed -> whether its times are of a quiet machine."""
-
-
-def busy_note(named: Iterable[tuple[str, RunSummary]]) -> list[str]:
-    """Return a note that names the rows with marked times, for (name of a row, run) pairs; nothing without any."""
-    named = list(named)
-    busy = {what: sorted({name for name, run in named if not steady(run)}) for what, steady in CLOCKS.items()}
-    said = [f"{what} of {', '.join(names)}" for what, names in busy.items() if names]
-    return [f"{BUSY} times of a machine that was not quiet, compared with no other: {'; '.join(said)}"] if said else []
-
-
-def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) -> list[str]:
+def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) -> list[str]:
     """Returns the notes of one table: first the general ones, then those about its runs."""
     runs = [run for variant in variants for run in variant.runs]
     return [
@@ -56,7 +29,7 @@ def notes(variants: Sequence[Variant], over_scenes: bool, protocol: Protocol) ->
     ]
 
 
-def camera_notes(variants: Sequence[Variant]) -> list[str]:
+def camera_notes(variants: Sequence[Repeats]) -> list[str]:
     """Returns the notes of a table by camera. All other notes stand below the table that precedes it."""
     runs = [run for variant in variants for run in variant.runs]
     return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
@@ -141,7 +114,7 @@ def _commits(done: str, sources: Sequence[CodeVersion]) -> list[str]:
     return said
 
 
-def _long_names(variants: Sequence[Variant]) -> list[str]:
+def _long_names(variants: Sequence[Repeats]) -> list[str]:
     return [
         f"{variant.name}: {', '.join(variant.options)}"
         for variant in variants
@@ -149,7 +122,7 @@ def _long_names(variants: Sequence[Variant]) -> list[str]:
     ]
 
 
-def _repeated_seeds(variants: Sequence[Variant]) -> list[str]:
+def _repeated_seeds(variants: Sequence[Repeats]) -> list[str]:
     """Names seeds that occur twice: such a run counts twice, but it is no independent repeat."""
     said = []
     for variant in variants:
@@ -160,7 +133,7 @@ def _repeated_seeds(variants: Sequence[Variant]) -> list[str]:
     return said
 
 
-def _lacking_seeds(variants: Sequence[Variant]) -> list[str]:
+def _lacking_seeds(variants: Sequence[Repeats]) -> list[str]:
     """Names variants that lack seeds which others have of a scene: seeds can differ by more than methods do."""
     every = sorted({(run.run.scene, run.run.seed) for variant in variants for run in variant.runs})
     said = []
@@ -176,7 +149,7 @@ def _lacking_seeds(variants: Sequence[Variant]) -> list[str]:
     return said
 
 
-def _unfinished(variants: Sequence[Variant]) -> list[str]:
+def _unfinished(variants: Sequence[Repeats]) -> list[str]:
     return [
         f"{_run(variant, run)} stopped at step {run.run.steps:,} of {run.run.max_steps:,}"
         for variant in variants
@@ -185,7 +158,7 @@ def _unfinished(variants: Sequence[Variant]) -> list[str]:
     ]
 
 
-def _scenes(variants: Sequence[Variant]) -> list[str]:
+def _scenes(variants: Sequence[Repeats]) -> list[str]:
     """Names the scenes of a mean, and the variants whose mean is over fewer."""
     every = sorted({run.run.scene for variant in variants for run in variant.runs})
     said = [f"scenes: {', '.join(every)}"]
@@ -196,7 +169,7 @@ def _scenes(variants: Sequence[Variant]) -> list[str]:
     return said
 
 
-def _caps(variants: Sequence[Variant]) -> list[str]:
+def _caps(variants: Sequence[Repeats]) -> list[str]:
     """Names counts that a cap limited: they say little about what a scene needs, and their shares even less."""
     said = []
     for variant in variants:
@@ -207,7 +180,7 @@ def _caps(variants: Sequence[Variant]) -> list[str]:
     return said
 
 
-def _guards(variants: Sequence[Variant]) -> str:
+def _guards(variants: Sequence[Repeats]) -> str:
     """Returns the alarms of every run that has any."""
     fired = [
         f"{_run(variant, run)} " + ", ".join(f"{name} {count:,}" for name, count in run.guards.alarms.items())
@@ -218,5 +191,5 @@ def _guards(variants: Sequence[Variant]) -> str:
     return "guards: " + ("; ".join(fired) or "none fired")
 
 
-def _run(variant: Variant, run: RunSummary) -> str:
+def _run(variant: Repeats, run: RunSummary) -> str:
     return f"{variant.name} (seed {run.run.seed})"

@@ -2,15 +2,107 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+
+from rich.table import Table
+from rich.text import Text
 
 from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
+from sparsestreet.pictures.plots import plot_runs
 from sparsestreet.records.configuration import Setting, config_hash, differing_options, only, without
-from sparsestreet.records.summary import RunSummary
+from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
 from sparsestreet.report.collect import RunRecord, check_definitions
 from sparsestreet.report.notes import camera_notes, notes
-from sparsestreet.report.quantities import Quantity, camera_quantities, quantities
-from sparsestreet.report.spread import Spread, spread
-from sparsestreet.report.variants import CLIP_KEYS, Variant, log_config, variants
+from sparsestreet.report.tables import BUSY, CAPPED, Spread, frames_steady, spread, training_steady
+from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity of the table."""
+
+    heading: str
+    value: Callable[[RunSummary], float | None]
+    text: Callable[[float], str]
+    relative: bool
+    """True: a comparison with the baseline reads as per cent of it (what remains). False: as a signed difference."""
+    count: bool = False
+    """Whether it counts Gaussians, which a cap can limit."""
+    steady: Callable[[RunSummary], bool] = lambda run: True
+    """Whether a run's value compares with others: a time of a machine that was not quiet does not."""
+
+
+def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
+    """Returns heading, id and format of each metric of a protocol, and of the metrics by lidar.
+
+    >>> [heading for heading, _, _ in protocol_metrics(DRIVESTUDIO)][:2]
+    ['PSNR', 'SSIM']
+    """
+    return (
+        ("PSNR", protocol.psnr, "{:.2f}"),
+        ("SSIM", protocol.ssim, "{:.4f}"),
+        *((f"LPIPS {name.split('_')[1]}", name, "{:.4f}") for name in protocol.lpips),
+        ("vehicle PSNR", protocol.vehicle[0], "{:.2f}"),
+        ("vehicle SSIM", protocol.vehicle[1], "{:.4f}"),
+        ("human PSNR", protocol.human[0], "{:.2f}"),
+        ("human SSIM", protocol.human[1], "{:.4f}"),
+        ("near PSNR", "psnr_near_lidar", "{:.2f}"),
+        ("beyond PSNR", "psnr_beyond_lidar", "{:.2f}"),
+    )
+
+
+_CAMERA_METRICS = (("", "psnr_full"), (" near", "psnr_near_lidar"), (" beyond", "psnr_beyond_lidar"))
+
+
+def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> tuple[Quantity, ...]:
+    """Returns the quantities that at least one of the runs has, with the metrics of a protocol."""
+    metrics = protocol_metrics(protocol)
+    nodes = dict.fromkeys(name for run in runs for name in run.gaussians)
+    known = (
+        *(Quantity(heading, _metric(name, HELD_OUT), text.format, False) for heading, name, text in metrics),
+        *_training_metrics(runs, metrics),
+        Quantity("Gaussians", lambda run: float(run.gaussians_total), "{:,.0f}".format, True, count=True),
+        *(Quantity(name, _node_count(name), "{:,.0f}".format, True, count=True) for name in nodes),
+        Quantity("MB", lambda run: run.bytes_total / 1e6, "{:.2f}".format, True),
+        Quantity("ms/frame", lambda run: run.latency.p50, "{:.1f}".format, True, steady=frames_steady),
+        Quantity("train s", lambda run: run.run.training_seconds, "{:.0f}".format, True, steady=training_steady),
+    )
+    return _measured(known, runs)
+
+
+def camera_quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
+    """Returns PSNR of each camera, in full and by lidar, if at least one run has it; nothing for a single camera."""
+    cameras = dict.fromkeys(camera for run in runs for camera in run.by_camera[run.main_split])
+    known = [
+        Quantity(f"camera {camera}{region}", _camera_metric(name, camera), "{:.2f}".format, False)
+        for camera in cameras
+        for region, name in _CAMERA_METRICS
+    ]
+    return _measured(known, runs) if len(cameras) > 1 else ()
+
+
+def _measured(known: Iterable[Quantity], runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
+    return tuple(quantity for quantity in known if any(quantity.value(run) is not None for run in runs))
+
+
+def _training_metrics(runs: Sequence[RunSummary], metrics: Sequence[tuple[str, str, str]]) -> list[Quantity]:
+    """Returns PSNR of the training views, which shows overfitting; all metrics if no run holds out a view."""
+    shown = metrics if all(run.main_split == TRAINING for run in runs) else metrics[:1]
+    return [
+        Quantity(f"train-view {heading}", _metric(name, TRAINING), text.format, False) for heading, name, text in shown
+    ]
+
+
+def _metric(name: str, split: str) -> Callable[[RunSummary], float | None]:
+    return lambda run: run.mean(name, split)
+
+
+def _camera_metric(name: str, camera: str) -> Callable[[RunSummary], float | None]:
+    return lambda run: run.camera_mean(name, camera)
+
+
+def _node_count(name: str) -> Callable[[RunSummary], float | None]:
+    return lambda run: float(run.gaussians[name]) if name in run.gaussians else None
 
 
 @dataclass(frozen=True)
@@ -74,7 +166,7 @@ def sections(
     check_definitions(records)
     runs = [record.summary for record in records]
     groups = [*_by_scene(runs), *_over_scenes(runs)]
-    parted = [variants(group.runs, runs) for group in groups]
+    parted = [repeats(group.runs, runs) for group in groups]
     if baseline is not None and not any(_reference(found, baseline) for found in parted):
         names = sorted({variant.name for found in parted for variant in found})
         raise ValueError(f"no run has the baseline {baseline!r}: choose one of {names}")
@@ -104,7 +196,7 @@ def _over_scenes(runs: Sequence[RunSummary]) -> list[_Group]:
         groups.setdefault((run.run.split, config_hash(_log_of_any_clip(run))), []).append(run)
     found = []
     for (split, _), group in sorted(groups.items()):
-        several = [variant for variant in variants(group) if len({run.run.scene for run in variant.runs}) > 1]
+        several = [variant for variant in repeats(group) if len({run.run.scene for run in variant.runs}) > 1]
         if several:
             kept = [run for variant in several for run in variant.runs]
             sizes = ", ".join(sorted({size for run in kept for size in run.resolutions}))
@@ -128,7 +220,7 @@ def _titles(groups: Sequence[_Group]) -> list[str]:
     return titles
 
 
-def _reference(found: Sequence[Variant], baseline: str | None) -> Variant | None:
+def _reference(found: Sequence[Repeats], baseline: str | None) -> Repeats | None:
     """Returns the variant with the baseline's name, or the only one with its label; None if there is none."""
     named = [variant for variant in found if variant.name == baseline]
     of_label = [variant for variant in found if variant.label == baseline]
@@ -139,7 +231,7 @@ def _reference(found: Sequence[Variant], baseline: str | None) -> Variant | None
 
 
 def _sections(
-    group: _Group, title: str, found: Sequence[Variant], baseline: str | None, protocol: Protocol
+    group: _Group, title: str, found: Sequence[Repeats], baseline: str | None, protocol: Protocol
 ) -> list[Section]:
     """Returns the table of a group, and the one by camera if there are several cameras."""
     reference = _reference(found, baseline)
@@ -164,7 +256,7 @@ def _sections(
     return [whole, section(f"PSNR by camera, {title}", True, cameras, camera_notes(ordered))]
 
 
-def _variant_row(variant: Variant, columns: Sequence[Quantity], over_scenes: bool) -> Row:
+def _variant_row(variant: Repeats, columns: Sequence[Quantity], over_scenes: bool) -> Row:
     """Returns mean and spread over runs, or over the means of each scene's runs."""
     units = _units(variant.runs, _clip) if over_scenes else [[run] for run in variant.runs]
     cells = [_spread_of([[quantity.value(run) for run in unit] for unit in units]) for quantity in columns]
@@ -174,7 +266,7 @@ def _variant_row(variant: Variant, columns: Sequence[Quantity], over_scenes: boo
     return Row(variant.name, runs, len(units), tuple(cells), False, _capped(variant), _busy(variant.runs, columns))
 
 
-def _difference_row(variant: Variant, reference: Variant, columns: Sequence[Quantity], over_scenes: bool) -> Row:
+def _difference_row(variant: Repeats, reference: Repeats, columns: Sequence[Quantity], over_scenes: bool) -> Row:
     """Returns differences between runs of the same scene and seed; several runs of one seed count as their mean."""
     ours, theirs = (
         {_clip_and_seed(unit[0]): unit for unit in _units(one.runs, _clip_and_seed)} for one in (variant, reference)
@@ -234,5 +326,124 @@ def _seeds(seeds: Iterable[int]) -> str:
     return f"n={len(known)} (seed {','.join(map(str, known))})" if known else "no shared seed"
 
 
-def _capped(variant: Variant) -> bool:
+def _capped(variant: Repeats) -> bool:
     return any(run.run.caps for run in variant.runs)
+
+
+ABSENT = "-"
+
+_MAX_COLUMNS = 5
+"""Largest number of variants and differences that stand in columns; more become rows if the terminal is wide enough."""
+
+
+def section_tables(sections: Sequence[Section], width: int = 80) -> list[Table | Text]:
+    """Returns title, tables and notes of the sections for ``rich.console.Console``, ``width`` characters wide.
+
+    Variants are columns, spread over as many tables as needed to cut no text. Many variants (a sweep) are rows if the
+    terminal is wide enough.
+    """
+    return [part for section in sections for part in _drawn(section, width)]
+
+
+def sections_markdown(sections: Sequence[Section]) -> str:
+    """Returns the sections as Markdown tables with notes; sections by camera have a row for each camera and region."""
+    blocks = []
+    for section in sections:
+        lines = _lines(section)
+        header, *lines = zip(*lines, strict=True) if section.by_camera else lines
+        texts = 1 if section.by_camera else 2
+        rule = ["---"] * texts + ["---:"] * (len(header) - texts)
+        table = "\n".join(
+            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (header, rule, *lines)
+        )
+        notes = "\n".join(f"- {note}" for note in section.notes)
+        blocks.append(f"### {section.title}\n\n{table}\n\n{notes}\n")
+    return "\n".join(blocks)
+
+
+def size_figure(records: Sequence[RunRecord], path: Path) -> None:
+    """Writes a scatter of all runs: PSNR of held-out views against Gaussians, one color for each variant.
+
+    Raises ValueError if no run has held-out views.
+    """
+    runs = [record.summary for record in records]
+    points = {
+        variant.name: [
+            (run.gaussians_total, psnr) for run in variant.runs if (psnr := run.mean("psnr_full", HELD_OUT)) is not None
+        ]
+        for variant in repeats(runs)
+    }
+    if not any(points.values()):
+        raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
+    plot_runs(path, {name: some for name, some in points.items() if some})
+
+
+def _drawn(section: Section, width: int) -> list[Table | Text]:
+    lines = _lines(section)
+    if len(section.rows) > _MAX_COLUMNS and sum(map(_room, zip(*lines, strict=True))) < width:
+        blocks = [lines]
+    else:
+        labels, *columns = lines
+        blocks = [list(zip(labels, *some, strict=True)) for some in _fitting(columns, width - 1 - _room(labels))]
+    # Texts, because rich would read the square brackets of strings as markup.
+    title, notes = Text(section.title, style="bold"), Text("\n".join(section.notes) + "\n")
+    return [title, *map(_table, blocks), notes]
+
+
+def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[list[Sequence[str]]]:
+    """Returns consecutive columns in groups that fit a width, at least one column in each."""
+    groups: list[list[Sequence[str]]] = []
+    left = 0
+    for column in columns:
+        if not groups or _room(column) > left:
+            groups.append([])
+            left = width
+        groups[-1].append(column)
+        left -= _room(column)
+    return groups
+
+
+def _room(column: Sequence[str]) -> int:
+    """Returns the width of a column in characters: its heading may break between words, its cells may not."""
+    heading, *cells = column
+    return max(*map(len, heading.split()), *map(len, cells)) + 3
+
+
+def _table(lines: Sequence[Sequence[str]]) -> Table:
+    table = Table()
+    for index, heading in enumerate(lines[0]):
+        table.add_column(Text(heading), justify="right" if index else "left", overflow="fold")
+    for line in lines[1:]:
+        table.add_row(*map(Text, line))
+    return table
+
+
+def _lines(section: Section) -> list[list[str]]:
+    """Returns header and rows as texts."""
+    header = ["method", "runs", *(quantity.heading for quantity in section.quantities)]
+    return [header, *(_texts(row, section.quantities) for row in section.rows)]
+
+
+def _texts(row: Row, quantities: Sequence[Quantity]) -> list[str]:
+    busy = row.busy or (False,) * len(quantities)
+    cells = [_cell(*one, row) for one in zip(row.cells, quantities, busy, strict=True)]
+    return [row.label, row.runs, *cells]
+
+
+def _cell(cell: Spread | None, quantity: Quantity, busy: bool, row: Row) -> str:
+    """Returns mean ± sd, marks of a count that a cap limited and of a time of a busy machine, and n if it differs.
+
+    A difference holds no time of a busy machine: it has the mark alone where nothing else is left.
+    """
+    if cell is None:
+        return BUSY if busy else ABSENT
+    percentage = row.difference and quantity.relative
+    number = "{:.1f}".format if percentage else quantity.text
+    sign = "" if not row.difference or percentage else "+" if cell.mean >= 0 else "-"
+    text = sign + number(abs(cell.mean) if sign else cell.mean)
+    if cell.sd is not None:
+        text += f" ± {number(cell.sd)}"
+    text += " %" if percentage else ""
+    text += f" {CAPPED}" if row.capped and quantity.count else ""
+    text += f" {BUSY}" if busy and not row.difference else ""
+    return text if cell.n == row.n else f"{text} (n={cell.n})"

@@ -7,8 +7,17 @@ import pytest
 import torch
 
 from sparsestreet.evaluation.speed import forget_peaks, peak_megabytes
-from sparsestreet.records.costs import COSTS, CostRecord, EffectGain, NodeCost, stage_costs, step_costs, update_costs
-from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
+from sparsestreet.records.costs import (
+    COSTS,
+    STEP_PHASES,
+    CostRecord,
+    EffectGain,
+    NodeCost,
+    StepPhase,
+    stage_costs,
+    step_costs,
+    update_costs,
+)
 from sparsestreet.records.strict_json import RecordError
 from tests.evaluation.frames import NOISE
 

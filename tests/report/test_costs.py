@@ -1,19 +1,32 @@
-"""What each arm costs, in absolute numbers."""
+"""What each variant costs, in absolute numbers."""
 
 from dataclasses import replace
 from typing import Any
 
-from sparsestreet.records.costs import update_costs
-from sparsestreet.report import RunRecord, collect
-from sparsestreet.report.arms import arms
-from sparsestreet.report.costs import what_arms_cost
+import pytest
+
+from sparsestreet.records.costs import EffectGain, update_costs
+from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.run import EffectDecision, RunDescription
+from sparsestreet.records.strict_json import RecordError
+from sparsestreet.report.collect import RunRecord, collect
+from sparsestreet.report.costs import (
+    QualityCurve,
+    curves_of,
+    mean_curve,
+    seconds_to,
+    time_to_quality,
+    what_effects_cost,
+    what_variants_cost,
+)
+from sparsestreet.report.variants import variants
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, write_sweep
 
 
 def test_means_over_the_runs_of_an_arm(tmp_path):
     """Forward is all of a step that is neither backward nor the optimizer: 1 + 2 + 0.5 + 0.25 + 0.125 ms."""
-    grid = what_arms_cost(arms(collect([write_sweep(tmp_path)])))
+    grid = what_variants_cost(variants(collect([write_sweep(tmp_path)])))
     names = [" ".join(heading).strip() for heading in grid.header]
     removal = dict(zip(names, (cell.text for cell in grid.rows[1]), strict=True))
     assert (removal["arm"], removal["n"], removal["Gaussians"]) == ("streetgs+removal", "3", "2,510")
@@ -24,7 +37,7 @@ def test_means_over_the_runs_of_an_arm(tmp_path):
 
 
 def test_without_cost_records_the_summary_is_left(tmp_path):
-    grid = what_arms_cost(arms(collect([write_sweep(tmp_path, curves=False)])))
+    grid = what_variants_cost(variants(collect([write_sweep(tmp_path, curves=False)])))
     assert [heading for _, heading in grid.header] == ["arm", "n", "Gaussians", "MB", "ms/frame", "train s"]
 
 
@@ -47,7 +60,7 @@ def test_every_column_has_a_number_of_its_own(tmp_path):
             peak_host_mb=800.0 + 50 * seed,
             peak_device_mb=6000.0 + 500 * seed,
         )
-    grid = what_arms_cost(arms(runs))
+    grid = what_variants_cost(variants(runs))
     (row,) = grid.rows
     assert grid.header == (
         *(("", "arm"), ("", "n"), ("", "Gaussians"), ("", "MB"), ("", "ms/frame"), ("", "train s")),
@@ -65,7 +78,7 @@ def test_every_column_has_a_number_of_its_own(tmp_path):
 
 def test_a_run_without_pruning_has_spent_no_seconds_on_it(tmp_path):
     update_costs(tmp_path, phases={"train": 9.0})
-    grid = what_arms_cost(arms([RunRecord(tmp_path, make_summary("m"))]))
+    grid = what_variants_cost(variants([RunRecord(tmp_path, make_summary("m"))]))
     assert dict(zip(grid.header, (cell.text for cell in grid.rows[0]), strict=True))["seconds", "pruning"] == "0.0"
 
 
@@ -73,6 +86,93 @@ def test_a_machine_that_was_not_quiet_is_named():
     calm, loud = make_summary("m"), make_summary("m", 1)
     latency = replace(loud.latency, noise=replace(loud.latency.noise, quiet=False))
     runs = [record(calm), record(replace(loud, latency=latency))]
-    grid = what_arms_cost(arms(runs))
+    grid = what_variants_cost(variants(runs))
     assert grid.notes[-1].startswith("§ times of a machine that was not quiet, compared with no other: frames of m")
     assert [cell.text for cell in grid.rows[0]][-2:] == ["40.00 §", "100.0"]
+
+
+LENS = EffectDecision(
+    name="lens", on=True, source="measured", reason="r", value=2.5, unit="px", threshold=0.5, noise=0.1,
+    numbers=250_000, ms=0.75, gain=None,
+)  # fmt: skip
+
+
+def planned(seed: int, *effects: EffectDecision):
+    summary = make_summary("m", seed)
+    run: RunDescription = replace(summary.run, effects=effects)
+    return replace(summary, run=run)
+
+
+def test_predictions_stand_beside_measurements(tmp_path):
+    sky = replace(LENS, name="sky", on=False, source="forced", value=None, threshold=None, numbers=0, gain=1.0)
+    runs = []
+    for seed in (0, 1):
+        runs.append(RunRecord(tmp_path / str(seed), planned(seed, LENS, sky)))
+        gains = {"lens": EffectGain(2.0 + seed, 1.0 if seed else None, None, 4)}
+        update_costs(tmp_path / str(seed), effects={"lens": 0.5 + seed}, gains=gains)
+    grid = what_effects_cost(variants(runs))
+    assert [[cell.text for cell in row] for row in grid.rows] == [
+        ["m", "lens", "on", "measured", "2.5 px", "0.5", "0.75", "1.00", "1", "-", "+2.50", "+1.00", "-"],
+        ["m", "sky", "off", "forced", "-", "-", "0.75", "-", "0", "+1.00", "-", "-", "-"],
+    ]
+
+
+def test_repeats_may_decide_otherwise(tmp_path):
+    runs = [RunRecord(tmp_path / str(seed), planned(seed, replace(LENS, on=bool(seed)))) for seed in (0, 1)]
+    (row,) = what_effects_cost(variants(runs)).rows
+    assert row[2].text == "on in 1 of 2"
+
+
+def test_records_without_a_plan_give_no_row(tmp_path):
+    assert what_effects_cost(variants([RunRecord(tmp_path, make_summary("m"))])).rows == ()
+
+
+def test_the_first_look_that_is_good_enough():
+    curve = QualityCurve((10.0, 20.0, 30.0), (20.0, 22.0, 21.5))
+    assert seconds_to(curve, 21.5) == 20.0  # nothing between two looks
+    assert seconds_to(curve, 22.1) is None
+
+
+def test_the_mean_is_over_looks_that_all_curves_have():
+    curves = [QualityCurve((10.0, 20.0), (20.0, 22.0)), QualityCurve((12.0, 24.0, 36.0), (21.0, 24.0, 25.0))]
+    assert mean_curve(curves) == QualityCurve((11.0, 22.0), (20.5, 23.0))
+
+
+def test_runs_of_one_scene_and_seed_are_their_mean(tmp_path):
+    """Runs that were trained on all views are in no mean with them."""
+    runs = []
+    for name, seconds, psnr, split in (("a", 10.0, 20.0, "some"), ("b", 12.0, 21.0, "some"), ("c", 99.0, 9.0, "none")):
+        HELD_OUT_CURVE.write(tmp_path / name, [HeldOutLook(seconds, 9, psnr, None, None)])
+        runs.append(record(make_summary("plain", split=split, training_psnr=20.0), str(tmp_path / name)))
+    (variant,) = variants(runs)
+    assert list(curves_of(variant).values()) == [QualityCurve((11.0,), (20.5,))]
+
+
+def test_seconds_to_the_plain_runs_quality(tmp_path):
+    """Curves end at -3, -0.8, -0.3 and 0 dB; removal ends 0.2, 0.3 and 0.4 dB lower, the control 2 dB."""
+    grid = time_to_quality(variants(collect([write_sweep(tmp_path)])))
+    rows = {row[0].text: [cell.text for cell in row[1:]] for row in grid.rows}
+    assert rows["streetgs"] == ["20.0 s", "30.0 s", "40.0 s"]
+    # Within 1 dB: at -0.8 - 0.2 (20 s), else 30 s. Within 0.5: -0.3 - 0.2 at 30 s, else 40 s.
+    assert rows["streetgs+removal"] == ["30.0 s", "40.0 s", "not reached"]
+    assert rows["control: streetgs+random"] == ["not reached"] * 3
+
+
+def test_the_last_look_of_the_plain_run_counts_not_its_best(tmp_path):
+    """It ends 1 dB below its best: 0.5 dB below its end are 18.5 dB, which it has at 10 s."""
+    looks = enumerate((18.6, 20.0, 19.0), start=1)
+    HELD_OUT_CURVE.write(tmp_path, [HeldOutLook(10.0 * step, step, psnr, None, None) for step, psnr in looks])
+    grid = time_to_quality(variants([record(make_summary("plain"), str(tmp_path))]))
+    assert [cell.text for cell in grid.rows[0][1:]] == ["10.0 s", "10.0 s", "20.0 s"]
+
+
+def test_no_curve_no_table(tmp_path):
+    assert time_to_quality(variants(collect([write_sweep(tmp_path, curves=False)]))) is None
+
+
+def test_a_malformed_curve_is_named(tmp_path):
+    run = write_sweep(tmp_path) / "streetgs_seed0"
+    path = HELD_OUT_CURVE.path(run)
+    path.write_text(path.read_text() + "soon,5,20.0,,\n")
+    with pytest.raises(RecordError, match=r"held_out\.csv, line 6: could not convert .*soon.*; train the run again"):
+        time_to_quality(variants(collect([tmp_path])))

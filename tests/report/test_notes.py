@@ -4,10 +4,9 @@ import dataclasses
 
 import pytest
 
-from sparsestreet.records.quality import HELD_OUT, MetricSummary
 from sparsestreet.records.run import CodeVersion
-from sparsestreet.records.summary import Evaluation
-from sparsestreet.report import sections
+from sparsestreet.records.summary import HELD_OUT, Evaluation, MetricSummary
+from sparsestreet.report.sections import sections
 from tests.evaluation.frames import CLEAN, MACHINE, make_summary
 from tests.report.test_sections import STREETS, records, street
 
