@@ -5,7 +5,7 @@ import re
 import statistics
 import textwrap
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -349,49 +349,59 @@ _MAX_NAMES_IN_PANEL = 6
 
 
 def held_out_over_time(variants: Sequence[Variant], path: Path) -> bool:
-    """Draws held-out PSNR over training seconds, a panel a method, a line a run. Returns whether a run has a curve."""
+    """Draw held-out PSNR over training seconds, a panel a method, a line a run. Return whether a run has a curve."""
     found = {
         variant.name: [curve for some in curves_of_runs(variant).values() for curve in some] for variant in variants
     }
     drawn = [variant for variant in variants if found[variant.name]]
-    if not drawn:
-        return False
-    methods = list(dict.fromkeys(variant.plain_label for variant in drawn))
-    figure, axes = panels(len(methods))
     says: Says = {}
-    look = styles(variants)
-    for one, method in zip(axes, methods, strict=True):
-        for variant in _of(drawn, method):
-            for curve in found[variant.name]:
-                name = f"curve {len(says)}"
-                one.plot(curve.seconds, curve.psnr, **_line(look[variant.name]), marker=".", markersize=3, gid=name)
-                looks = zip(curve.seconds, curve.psnr, strict=True)
-                says[name] = [f"{variant.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
-        _finish(one, method, "training seconds")
-    axes[0].set_ylabel("held-out PSNR, dB")
-    _legends(figure, axes)
-    write_svg(figure, path, says)
-    return True
+
+    def draw(axes: Axes, variant: Variant, look: Style) -> None:
+        for curve in found[variant.name]:
+            name = f"curve {len(says)}"
+            axes.plot(curve.seconds, curve.psnr, **_line(look), marker=".", markersize=3, gid=name)
+            looks = zip(curve.seconds, curve.psnr, strict=True)
+            says[name] = [f"{variant.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
+
+    return _over_time(variants, drawn, draw, ("training seconds", "held-out PSNR, dB"), path, says)
 
 
 def counts_over_time(variants: Sequence[Variant], path: Path) -> bool:
-    """Draws the number of Gaussians over steps, a panel a method, a line a run; dots mark masks and pruning passes."""
+    """Draw the number of Gaussians over steps, a panel a method, a line a run; dots mark masks and pruning passes."""
     drawn = [variant for variant in variants if any(LEDGER.exists(record.folder) for record in variant.records)]
-    if not drawn:
-        return False
+
+    def draw(axes: Axes, variant: Variant, look: Style) -> None:
+        for record in variant.records:
+            if LEDGER.exists(record.folder):
+                _counts(axes, look, record.folder)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+
+    return _over_time(variants, drawn, draw, ("step", "Gaussians"), path, {})
+
+
+def _over_time(
+    variants: Sequence[Variant],
+    drawn: Sequence[Variant],
+    draw: Callable[[Axes, Variant, Style], None],
+    labels: tuple[str, str],
+    path: Path,
+    says: Says,
+) -> bool:
+    """Write a panel for each method of the drawn variants. Return whether there is any."""
     methods = list(dict.fromkeys(variant.plain_label for variant in drawn))
+    if not methods:
+        return False
     figure, axes = panels(len(methods))
     look = styles(variants)
     for one, method in zip(axes, methods, strict=True):
-        for variant in _of(drawn, method):
-            for record in variant.records:
-                if LEDGER.exists(record.folder):
-                    _counts(one, look[variant.name], record.folder)
-        one.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
-        _finish(one, method, "step")
-    axes[0].set_ylabel("Gaussians")
+        for variant in drawn:
+            if variant.plain_label == method:
+                draw(one, variant, look[variant.name])
+        one.set_title(method, fontsize=10)
+        one.set_xlabel(labels[0])
+    axes[0].set_ylabel(labels[1])
     _legends(figure, axes)
-    write_svg(figure, path)
+    write_svg(figure, path, says)
     return True
 
 
@@ -445,17 +455,8 @@ def _frame_costs(variant: Variant) -> dict[str, float]:
     return {part: statistics.fmean(values) for part, values in found.items()}
 
 
-def _of(variants: Sequence[Variant], method: str) -> list[Variant]:
-    return [variant for variant in variants if variant.plain_label == method]
-
-
 def _line(look: Style) -> dict[str, Any]:
     return {"color": look.color, "linestyle": look.dashes, "linewidth": 1.2, "alpha": 0.85, "label": look.kind}
-
-
-def _finish(axes: Axes, title: str, x_label: str) -> None:
-    axes.set_title(title, fontsize=10)
-    axes.set_xlabel(x_label)
 
 
 def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
@@ -504,17 +505,10 @@ def _over_training(axes: Axes, variant: Variant, shown: Sequence[Variant], proto
     mean = mean_curve(curves)
     look, end = styles(shown)[variant.name], [len(mean.seconds) - 1]
     dashes = _DASHES_OF_KIND.get(look.kind, "-.")
-    paint = _paint_among(variant, shown)
+    paint = _paint(styles(shown), variant)
     axes.plot(
         mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(variant)
     )
-
-
-def _paint_among(variant: Variant, shown: Sequence[Variant]) -> str:
-    """Returns the color of the variant's method, or of its sparsification if there is only one method."""
-    look = styles(shown)
-    own = look[variant.name]
-    return own.method if len({one.method for one in look.values()}) > 1 else own.color
 
 
 def _draw_points(axes: Axes, variant: Variant, shown: Sequence[Variant], cost: str, protocol: Protocol) -> None:
@@ -522,7 +516,7 @@ def _draw_points(axes: Axes, variant: Variant, shown: Sequence[Variant], cost: s
     points = _points(variant, cost, _held_out(protocol.psnr))
     if points.empty:
         return
-    paint = _paint_among(variant, shown)
+    paint = _paint(styles(shown), variant)
     axes.scatter(points["cost"], points["quality"], s=8, color=paint, alpha=0.5)
     marker = styles(shown)[variant.name].marker
     axes.scatter(*_mean_point(points), s=44, color=paint, marker=marker, label=_label(variant), zorder=3)

@@ -11,7 +11,7 @@ from sparsestreet.records.costs import COSTS, PRUNE, CostRecord
 from sparsestreet.records.renders import NOVEL
 from sparsestreet.records.summary import RunSummary
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.tables import frames_steady, training_steady
+from sparsestreet.report.tables import CLOCKS
 
 CLIP_KEYS = ("data.log.first_frame", "data.log.last_frame")
 """Options that select a part of a log. Runs that differ in them have different scenes, as runs of different logs do."""
@@ -27,13 +27,22 @@ TRUTH = {
 
 
 def run_frame(records: Sequence[RunRecord]) -> pd.DataFrame:
-    """Return a row for each run; a number that no record holds is NaN.
+    """Return ``summary_frame`` with the numbers of the other records: a row for each run, NaN where none has it.
+
+    More columns: parts of ``records/cost.json``, and ``NAME at 1 m`` for each distance beside the recorded path. Raises
+    RecordError for a malformed record.
+    """
+    return pd.DataFrame([dict(_numbers(record.summary)) | dict(_of_other_records(record.folder)) for record in records])
+
+
+def summary_frame(runs: Sequence[RunSummary]) -> pd.DataFrame:
+    """Return a row for each run; a number that its summary lacks is NaN.
 
     Beside ``UNIT``: ``whole`` (trained on all views), ``frames`` and ``training`` (timed on a quiet machine), size and
-    times under their headings, ``SPLIT METRIC`` for each mean of an evaluation, parts of ``records/cost.json``, and
-    ``NAME at 1 m`` for each distance beside the recorded path. Raises RecordError for a malformed record.
+    times under their headings, ``Gaussians of NODE``, ``SPLIT METRIC`` for each mean of an evaluation, and ``camera
+    NUMBER METRIC`` for those of a camera.
     """
-    return pd.DataFrame([dict(_numbers(record)) for record in records])
+    return pd.DataFrame([dict(_numbers(run)) for run in runs])
 
 
 def clip_of(run: RunSummary) -> tuple[str, str]:
@@ -41,13 +50,13 @@ def clip_of(run: RunSummary) -> tuple[str, str]:
     return run.run.scene, config_hash(only(run.run.config, CLIP_KEYS))
 
 
-def _numbers(record: RunRecord) -> Iterator[tuple[str, object]]:
-    summary, seconds = record.summary, record.summary.run.training_seconds
+def _numbers(summary: RunSummary) -> Iterator[tuple[str, object]]:
+    seconds = summary.run.training_seconds
     yield from zip(UNIT, (*clip_of(summary), summary.run.seed), strict=True)
     yield "whole", summary.run.split == "none"
-    yield "frames", frames_steady(summary)
-    yield "training", training_steady(summary)
+    yield from ((clock, steady(summary)) for clock, steady in CLOCKS.items())
     yield "Gaussians", float(summary.gaussians_total)
+    yield from ((f"Gaussians of {name}", float(count)) for name, count in summary.gaussians.items())
     yield "MB", summary.bytes_total / 1e6
     yield "ms/frame", summary.latency.p50
     yield "FPS", 1000 / summary.latency.p50
@@ -55,10 +64,15 @@ def _numbers(record: RunRecord) -> Iterator[tuple[str, object]]:
     yield "train minutes", None if seconds is None else seconds / 60
     for split, metrics in summary.quality.items():
         yield from ((f"{split} {name}", one.mean) for name, one in metrics.items())
-    costs = COSTS.find(record.folder)
+    for camera, means in summary.by_camera[summary.main_split].items():
+        yield from ((f"camera {camera} {name}", mean) for name, mean in means.items())
+
+
+def _of_other_records(run: Path) -> Iterator[tuple[str, object]]:
+    costs = COSTS.find(run)
     if costs is not None:
         yield from _costs(costs)
-    for meters, numbers in shifts_of(record.folder).items():
+    for meters, numbers in shifts_of(run).items():
         yield from ((f"{name} at {meters:g} m", value) for name, value in numbers.items())
 
 

@@ -15,11 +15,9 @@ from sparsestreet.pictures.images import drawn_views, picture_path
 from sparsestreet.records.run import FailedRun
 from sparsestreet.records.summary import QUALITY
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.tables import ABSENT, Cell, Grid, frames_steady, training_steady
+from sparsestreet.report.tables import ABSENT, THEIRS, Cell, Grid, frames_steady, training_steady, without_empty
 from sparsestreet.report.variants import Variant
 
-_THEIRS = ", paper"
-"""The end of a heading whose column has published numbers."""
 _MAX_FULL_SIZE_COLUMNS = 14
 """Columns from which on a table is printed smaller."""
 _HERE = Path(__file__).parent
@@ -104,12 +102,12 @@ def _sets(grids: Sequence[Grid]) -> dict[tuple[str, ...], str]:
 
 
 def _grid(grid: Grid, sets: Mapping[tuple[str, ...], str]) -> str:
-    grid = _without_empty(grid)
+    header, rows = without_empty(grid.header, grid.rows)
+    grid = replace(grid, header=tuple(header), rows=tuple(rows))
     above = "".join(f"<th class='above' colspan='{span}'>{escape(text)}</th>" for text, span in grid.spans)
     above = f"<tr>{above}</tr>" if any(text for text, _ in grid.spans) else ""
     heads = "".join(
-        f"<th{' class=theirs' if heading.endswith(_THEIRS) else ''}>{escape(heading)}</th>"
-        for _, heading in grid.header
+        f"<th{' class=theirs' if heading.endswith(THEIRS) else ''}>{escape(heading)}</th>" for _, heading in grid.header
     )
     rows = "\n".join("<tr>" + "".join(_cell(cell, sets) for cell in row) + "</tr>" for row in grid.rows)
     wide = "wide many" if len(grid.header) > _MAX_FULL_SIZE_COLUMNS else "wide"
@@ -119,20 +117,9 @@ def _grid(grid: Grid, sets: Mapping[tuple[str, ...], str]) -> str:
     )
 
 
-def _without_empty(grid: Grid) -> Grid:
-    """Returns the table without columns for published numbers of which there are none."""
-    kept = [
-        index
-        for index, (_, heading) in enumerate(grid.header)
-        if not heading.endswith(_THEIRS) or any(row[index].text != ABSENT for row in grid.rows)
-    ]
-    rows = tuple(tuple(row[index] for index in kept) for row in grid.rows)
-    return replace(grid, header=tuple(grid.header[index] for index in kept), rows=rows)
-
-
 def _cell(cell: Cell, sets: Mapping[tuple[str, ...], str]) -> str:
     text = f"<b>{escape(cell.text)}</b>" if cell.bold else escape(cell.text)
-    if cell.runs and cell.text != "-":
+    if cell.runs and cell.text != ABSENT:
         target = sets.get(cell.runs, f"run-{cell.runs[0]}")
         text = f"<a href='#{escape(target)}'>{text}</a>"
     title = f" title='{escape(cell.exact)}'" if cell.exact else ""

@@ -11,7 +11,7 @@ from pathlib import Path
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.run import FailedRun
 from sparsestreet.records.summary import HELD_OUT, TRAINING
-from sparsestreet.report.tables import ABSENT, Cell, Grid
+from sparsestreet.report.tables import ABSENT, THEIRS, Cell, Grid, without_empty
 from sparsestreet.report.variants import Variant, busy_variants
 
 Key = tuple[str, str, str]
@@ -182,15 +182,10 @@ def paper_table(
     ]
     header = [("", "method"), ("", "n")]
     for key in table.columns:
-        header += [(_GROUPS[key[0]], _heading(key)), (_GROUPS[key[0]], f"{_heading(key)}, paper")]
-    # The paper's columns stand where it has a number for one of our rows.
-    kept = [
-        index
-        for index, (_, heading) in enumerate(header)
-        if sweep in TABLES or not heading.endswith(", paper") or any(row[index].text != ABSENT for row in rows)
-    ]
-    header, rows = [header[index] for index in kept], [tuple(row[index] for index in kept) for row in rows]
-    beside = any(heading.endswith(", paper") for _, heading in header)
+        header += [(_GROUPS[key[0]], _heading(key)), (_GROUPS[key[0]], f"{_heading(key)}{THEIRS}")]
+    if sweep not in TABLES:
+        header, rows = without_empty(header, rows)
+    beside = any(heading.endswith(THEIRS) for _, heading in header)
     of = f"Table {table.number} of the paper" if sweep in TABLES else "All arms, in the layout of the paper's Table 1"
     return Grid(
         "paper",
@@ -251,7 +246,7 @@ def _column(key: Key, protocol: Protocol) -> str | None:
 def metric_id(protocol: Protocol, region: str, quantity: str) -> str | None:
     """Returns the id of a metric under a protocol, or None.
 
-    >>> from sparsestreet.metrics.protocols import DRIVESTUDIO
+    >>> from sparsestreet.metrics.definitions import DRIVESTUDIO
     >>> metric_id(DRIVESTUDIO, "full", "psnr") == DRIVESTUDIO.psnr
     True
     """

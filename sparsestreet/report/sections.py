@@ -1,19 +1,21 @@
 """Sections of a report, a table each: rows of repeats, differences to a baseline, and means over scenes."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
 from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.pictures.plots import plot_runs
-from sparsestreet.records.configuration import Setting, config_hash, differing_options, only, without
+from sparsestreet.records.configuration import Setting, config_hash, differing_options, without
 from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
 from sparsestreet.report.collect import RunRecord, check_definitions
+from sparsestreet.report.frame import UNIT, by_scene, by_unit, summary_frame
 from sparsestreet.report.notes import camera_notes, notes
-from sparsestreet.report.tables import BUSY, CAPPED, Spread, frames_steady, spread, training_steady
+from sparsestreet.report.tables import ABSENT, BUSY, CAPPED, Spread, markdown_lines, spread
 from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
 
 
@@ -22,14 +24,16 @@ class Quantity:
     """One quantity of the table."""
 
     heading: str
-    value: Callable[[RunSummary], float | None]
-    text: Callable[[float], str]
-    relative: bool
+    column: str
+    """Of ``summary_frame``."""
+    text: str
+    """Format of its mean."""
+    relative: bool = False
     """True: a comparison with the baseline reads as per cent of it (what remains). False: as a signed difference."""
     count: bool = False
     """Whether it counts Gaussians, which a cap can limit."""
-    steady: Callable[[RunSummary], bool] = lambda run: True
-    """Whether a run's value compares with others: a time of a machine that was not quiet does not."""
+    clock: str = ""
+    """What is timed, a key of ``CLOCKS``: a time of a machine that was not quiet compares with none. Empty: no time."""
 
 
 def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
@@ -52,29 +56,36 @@ def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
 
 
 _CAMERA_METRICS = (("", "psnr_full"), (" near", "psnr_near_lidar"), (" beyond", "psnr_beyond_lidar"))
+_TIMES = (
+    Quantity("MB", "MB", "{:.2f}", relative=True),
+    Quantity("ms/frame", "ms/frame", "{:.1f}", relative=True, clock="frames"),
+    Quantity("train s", "train s", "{:.0f}", relative=True, clock="training"),
+)
 
 
 def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> tuple[Quantity, ...]:
-    """Returns the quantities that at least one of the runs has, with the metrics of a protocol."""
+    """Return the quantities that at least one of the runs has, with the metrics of a protocol.
+
+    PSNR of training views shows overfitting; all of their metrics are shown if no run holds out a view.
+    """
     metrics = protocol_metrics(protocol)
+    of_training = metrics if all(run.main_split == TRAINING for run in runs) else metrics[:1]
     nodes = dict.fromkeys(name for run in runs for name in run.gaussians)
+    counts = {"Gaussians": "Gaussians"} | {name: f"Gaussians of {name}" for name in nodes}
     known = (
-        *(Quantity(heading, _metric(name, HELD_OUT), text.format, False) for heading, name, text in metrics),
-        *_training_metrics(runs, metrics),
-        Quantity("Gaussians", lambda run: float(run.gaussians_total), "{:,.0f}".format, True, count=True),
-        *(Quantity(name, _node_count(name), "{:,.0f}".format, True, count=True) for name in nodes),
-        Quantity("MB", lambda run: run.bytes_total / 1e6, "{:.2f}".format, True),
-        Quantity("ms/frame", lambda run: run.latency.p50, "{:.1f}".format, True, steady=frames_steady),
-        Quantity("train s", lambda run: run.run.training_seconds, "{:.0f}".format, True, steady=training_steady),
+        *(Quantity(heading, f"{HELD_OUT} {name}", text) for heading, name, text in metrics),
+        *(Quantity(f"train-view {heading}", f"{TRAINING} {name}", text) for heading, name, text in of_training),
+        *(Quantity(name, column, "{:,.0f}", relative=True, count=True) for name, column in counts.items()),
+        *_TIMES,
     )
     return _measured(known, runs)
 
 
 def camera_quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
-    """Returns PSNR of each camera, in full and by lidar, if at least one run has it; nothing for a single camera."""
+    """Return PSNR of each camera, in full and by lidar, if at least one run has it; nothing for a single camera."""
     cameras = dict.fromkeys(camera for run in runs for camera in run.by_camera[run.main_split])
     known = [
-        Quantity(f"camera {camera}{region}", _camera_metric(name, camera), "{:.2f}".format, False)
+        Quantity(f"camera {camera}{region}", f"camera {camera} {name}", "{:.2f}")
         for camera in cameras
         for region, name in _CAMERA_METRICS
     ]
@@ -82,27 +93,8 @@ def camera_quantities(runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
 
 
 def _measured(known: Iterable[Quantity], runs: Sequence[RunSummary]) -> tuple[Quantity, ...]:
-    return tuple(quantity for quantity in known if any(quantity.value(run) is not None for run in runs))
-
-
-def _training_metrics(runs: Sequence[RunSummary], metrics: Sequence[tuple[str, str, str]]) -> list[Quantity]:
-    """Returns PSNR of the training views, which shows overfitting; all metrics if no run holds out a view."""
-    shown = metrics if all(run.main_split == TRAINING for run in runs) else metrics[:1]
-    return [
-        Quantity(f"train-view {heading}", _metric(name, TRAINING), text.format, False) for heading, name, text in shown
-    ]
-
-
-def _metric(name: str, split: str) -> Callable[[RunSummary], float | None]:
-    return lambda run: run.mean(name, split)
-
-
-def _camera_metric(name: str, camera: str) -> Callable[[RunSummary], float | None]:
-    return lambda run: run.camera_mean(name, camera)
-
-
-def _node_count(name: str) -> Callable[[RunSummary], float | None]:
-    return lambda run: float(run.gaussians[name]) if name in run.gaussians else None
+    found = set(summary_frame(runs).dropna(axis="columns", how="all").columns)
+    return tuple(quantity for quantity in known if quantity.column in found)
 
 
 @dataclass(frozen=True)
@@ -257,68 +249,39 @@ def _sections(
 
 
 def _variant_row(variant: Repeats, columns: Sequence[Quantity], over_scenes: bool) -> Row:
-    """Returns mean and spread over runs, or over the means of each scene's runs."""
-    units = _units(variant.runs, _clip) if over_scenes else [[run] for run in variant.runs]
-    cells = [_spread_of([[quantity.value(run) for run in unit] for unit in units]) for quantity in columns]
-    runs = (
-        f"{len(units)} scenes, n={len(variant.runs)}" if over_scenes else _seeds(run.run.seed for run in variant.runs)
-    )
-    return Row(variant.name, runs, len(units), tuple(cells), False, _capped(variant), _busy(variant.runs, columns))
+    """Return mean and spread over runs, or over the means of each scene's runs."""
+    frame = summary_frame(variant.runs)
+    n = frame.groupby(UNIT[:2]).ngroups if over_scenes else len(frame)
+    values = [frame.reindex(columns=[*UNIT, one.column]).dropna().set_index(UNIT)[one.column] for one in columns]
+    cells = tuple(spread((by_scene(some) if over_scenes else some).tolist()) for some in values)
+    runs = f"{n} scenes, n={len(frame)}" if over_scenes else _seeds(frame["seed"])
+    return Row(variant.name, runs, n, cells, False, _capped(variant), _busy(frame, columns))
 
 
 def _difference_row(variant: Repeats, reference: Repeats, columns: Sequence[Quantity], over_scenes: bool) -> Row:
-    """Returns differences between runs of the same scene and seed; several runs of one seed count as their mean."""
-    ours, theirs = (
-        {_clip_and_seed(unit[0]): unit for unit in _units(one.runs, _clip_and_seed)} for one in (variant, reference)
-    )
-    shared = sorted(ours.keys() & theirs.keys())
-    units: dict[object, list[tuple[str, str, int]]] = {}
-    for key in shared:
-        units.setdefault(key[:2] if over_scenes else key, []).append(key)
-    cells = [
-        _spread_of([[_difference(ours[key], theirs[key], quantity) for key in unit] for unit in units.values()])
-        for quantity in columns
-    ]
-    runs = f"{len(units)} scenes, n={len(shared)}" if over_scenes else _seeds(seed for *_, seed in shared)
+    """Return differences between runs of the same scene and seed; several runs of one seed count as their mean."""
+    frames = [summary_frame(one.runs).set_index(UNIT, drop=False) for one in (variant, reference)]
+    shared = frames[0].index.unique().intersection(frames[1].index.unique())
+    ours, theirs = (frame.loc[frame.index.isin(shared)].reset_index(drop=True) for frame in frames)
+    n = len(shared.droplevel("seed").unique()) if over_scenes else len(shared)
+    differences = [_differences(ours, theirs, quantity) for quantity in columns]
+    cells = tuple(spread((by_scene(some) if over_scenes else some).tolist()) for some in differences)
+    runs = f"{n} scenes, n={len(shared)}" if over_scenes else _seeds(shared.get_level_values("seed"))
     label = f"{variant.name} against {reference.name}"
-    busy = _busy([run for key in shared for run in (*ours[key], *theirs[key])], columns)
-    return Row(label, runs, len(units), tuple(cells), True, _capped(variant) or _capped(reference), busy)
+    busy = _busy(pd.concat([ours, theirs]), columns)
+    return Row(label, runs, n, cells, True, _capped(variant) or _capped(reference), busy)
 
 
-def _busy(runs: Iterable[RunSummary], columns: Sequence[Quantity]) -> tuple[bool, ...]:
-    runs = list(runs)
-    return tuple(not all(quantity.steady(run) for run in runs) for quantity in columns)
+def _differences(ours: pd.DataFrame, theirs: pd.DataFrame, quantity: Quantity) -> pd.Series:
+    """Return scene, clip and seed -> the difference, or what remains in per cent; no time of a busy machine."""
+    steady = [frame.loc[frame[quantity.clock]] if quantity.clock else frame for frame in (ours, theirs)]
+    value, reference = (by_unit(frame, quantity.column) for frame in steady)
+    found = 100 * value / reference[reference != 0] if quantity.relative else value - reference
+    return found.dropna()
 
 
-def _clip(run: RunSummary) -> tuple[str, str]:
-    """Returns what identifies a scene: the log, and the part of it that was read."""
-    return run.run.scene, config_hash(only(run.run.config, CLIP_KEYS))
-
-
-def _clip_and_seed(run: RunSummary) -> tuple[str, str, int]:
-    return *_clip(run), run.run.seed
-
-
-def _units(runs: Iterable[RunSummary], key: Callable[[RunSummary], object]) -> list[list[RunSummary]]:
-    units: dict[object, list[RunSummary]] = {}
-    for run in runs:
-        units.setdefault(key(run), []).append(run)
-    return list(units.values())
-
-
-def _spread_of(units: Iterable[Iterable[float | None]]) -> Spread | None:
-    """Returns the spread over units; each unit counts as the mean of its values."""
-    means = [spread([value for value in unit if value is not None]) for unit in units]
-    return spread([unit.mean for unit in means if unit is not None])
-
-
-def _difference(runs: Sequence[RunSummary], others: Sequence[RunSummary], quantity: Quantity) -> float | None:
-    value, reference = (
-        _spread_of([quantity.value(run)] for run in some if quantity.steady(run)) for some in (runs, others)
-    )
-    if value is None or reference is None or (quantity.relative and reference.mean == 0):
-        return None
-    return 100 * value.mean / reference.mean if quantity.relative else value.mean - reference.mean
+def _busy(frame: pd.DataFrame, columns: Sequence[Quantity]) -> tuple[bool, ...]:
+    return tuple(bool(one.clock) and not frame[one.clock].all() for one in columns)
 
 
 def _seeds(seeds: Iterable[int]) -> str:
@@ -329,8 +292,6 @@ def _seeds(seeds: Iterable[int]) -> str:
 def _capped(variant: Repeats) -> bool:
     return any(run.run.caps for run in variant.runs)
 
-
-ABSENT = "-"
 
 _MAX_COLUMNS = 5
 """Largest number of variants and differences that stand in columns; more become rows if the terminal is wide enough."""
@@ -353,9 +314,7 @@ def sections_markdown(sections: Sequence[Section]) -> str:
         header, *lines = zip(*lines, strict=True) if section.by_camera else lines
         texts = 1 if section.by_camera else 2
         rule = ["---"] * texts + ["---:"] * (len(header) - texts)
-        table = "\n".join(
-            "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in (header, rule, *lines)
-        )
+        table = markdown_lines((header, rule, *lines))
         notes = "\n".join(f"- {note}" for note in section.notes)
         blocks.append(f"### {section.title}\n\n{table}\n\n{notes}\n")
     return "\n".join(blocks)
@@ -438,7 +397,7 @@ def _cell(cell: Spread | None, quantity: Quantity, busy: bool, row: Row) -> str:
     if cell is None:
         return BUSY if busy else ABSENT
     percentage = row.difference and quantity.relative
-    number = "{:.1f}".format if percentage else quantity.text
+    number = ("{:.1f}" if percentage else quantity.text).format
     sign = "" if not row.difference or percentage else "+" if cell.mean >= 0 else "-"
     text = sign + number(abs(cell.mean) if sign else cell.mean)
     if cell.sd is not None:

@@ -4,7 +4,7 @@ import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import compress, groupby
 
 from scipy.special import stdtrit
 
@@ -64,6 +64,19 @@ class Grid:
         return [(text, len(list(group))) for text, group in groupby(group for group, _ in self.header)]
 
 
+THEIRS = ", paper"
+"""The end of a heading whose column has published numbers."""
+
+
+def without_empty(
+    header: Sequence[tuple[str, str]], rows: Sequence[tuple[Cell, ...]]
+) -> tuple[list[tuple[str, str]], list[tuple[Cell, ...]]]:
+    """Return header and rows without columns for published numbers of which there are none."""
+    shown = [not heading.endswith(THEIRS) or any(row[at].text != ABSENT for row in rows)
+             for at, (_, heading) in enumerate(header)]  # fmt: skip
+    return list(compress(header, shown)), [tuple(compress(row, shown)) for row in rows]
+
+
 def markdown(grids: Sequence[Grid]) -> str:
     """Returns the tables with their notes as Markdown.
 
@@ -82,9 +95,13 @@ def _markdown(grid: Grid) -> str:
     header = [f"{group} {heading}".strip() for group, heading in grid.header]
     lines = [header, ["---", *["---:"] * (len(header) - 1)]]
     lines += [[f"**{cell.text}**" if cell.bold else cell.text for cell in row] for row in grid.rows]
-    table = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
     notes = "".join(f"- {note}\n" for note in grid.notes)
-    return f"### {grid.title}\n\n{table}\n\n{notes}"
+    return f"### {grid.title}\n\n{markdown_lines(lines)}\n\n{notes}"
+
+
+def markdown_lines(lines: Iterable[Iterable[str]]) -> str:
+    """Return lines of cells as a Markdown table."""
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
 
 
 def latex(grids: Sequence[Grid]) -> str:
@@ -215,4 +232,11 @@ def busy_note(named: Iterable[tuple[str, RunSummary]]) -> list[str]:
     named = list(named)
     busy = {what: sorted({name for name, run in named if not steady(run)}) for what, steady in CLOCKS.items()}
     said = [f"{what} of {', '.join(names)}" for what, names in busy.items() if names]
-    return [f"{BUSY} times of a machine that was not quiet, compared with no other: {'; '.join(said)}"] if said else []
+    return busy_words(said)
+
+
+def busy_words(named: Sequence[str]) -> list[str]:
+    """Return the note that explains the mark of times; nothing where none has it."""
+    return (
+        [f"{BUSY} times of a machine that was not quiet, compared with no other: {'; '.join(named)}"] if named else []
+    )

@@ -1,7 +1,8 @@
 """The cost of getting smaller: paired differences, and the best variant of a sweep at one quality or one size."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 
 import pandas as pd
 
@@ -152,12 +153,19 @@ def _exactly(interval: ConfidenceInterval) -> str:
 
 @dataclass(frozen=True)
 class _Candidate:
+    """A variant beside its plain one, over the scenes and seeds that both have."""
+
     variant: Variant
     plain: Variant
-    loss: float
-    """dB; positive if it is worse."""
+    gain: ConfidenceInterval
+    """dB, negative if the variant is worse."""
     share: float
-    """Share of the plain variant's Gaussians that remains."""
+    """Per cent of the plain variant's Gaussians that remain."""
+
+    @property
+    def loss(self) -> float:
+        """What it loses, dB; negative if it is better."""
+        return -self.gain.mean
 
 
 def _candidates(plain: Variant, variants: Sequence[Variant], protocol: Protocol) -> list[_Candidate]:
@@ -165,39 +173,47 @@ def _candidates(plain: Variant, variants: Sequence[Variant], protocol: Protocol)
     for variant in variants:
         if plain_of(variant, variants) is not plain:
             continue
-        loss = paired(variant, plain, _held_out(protocol.psnr))
+        gain = paired(variant, plain, _held_out(protocol.psnr))
         share = paired(variant, plain, "Gaussians", relative=True)
-        if loss is not None and share is not None:
-            found.append(_Candidate(variant, plain, -loss.mean, 1 + share.mean / 100))
+        if gain is not None and share is not None:
+            found.append(_Candidate(variant, plain, gain, 100 * (1 + share.mean / 100)))
     return found
 
 
 def matched_quality(variants: Sequence[Variant], protocol: Protocol) -> Grid:
-    """Returns the variants with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
-    rows, notes = [], [f"{_OF_THIS_SWEEP}: plain counts as its own candidate", _NO_CONTROLS]
-    for plain in (variant for variant in variants if variant.sparsify == "none"):
-        for most in LOSSES:
-            allowed = [one for one in _candidates(plain, variants, protocol) if one.loss <= most]
-            best, control = (min(some, key=lambda one: one.share, default=None) for some in _parted(allowed))
-            rows.append((Cell(f"{_named(plain)}, at most {most:g} dB"), *_chosen(best)))
-            if control is not None and (best is None or control.share < best.share):
-                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is smaller")
-    notes += [*_caps(variants), *busy_variants(variants)]
-    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), tuple(notes))
+    """Return the variants with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
+    limits = {f"at most {most:g} dB": most for most in LOSSES}
+    rows, notes = _matched(variants, protocol, limits, "loss", "share", "smaller")
+    notes = (f"{_OF_THIS_SWEEP}: plain counts as its own candidate", _NO_CONTROLS, *notes)
+    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, rows, notes)
 
 
 def matched_budget(variants: Sequence[Variant], protocol: Protocol) -> Grid:
-    """Returns the variants with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
-    rows, notes = [], [_OF_THIS_SWEEP, _NO_CONTROLS]
+    """Return the variants with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
+    limits = {f"at most {100 * share:g} % of its Gaussians": 100 * share for share in SHARES}
+    rows, notes = _matched(variants, protocol, limits, "share", "loss", "better")
+    notes = (_OF_THIS_SWEEP, _NO_CONTROLS, *notes)
+    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, rows, notes)
+
+
+def _matched(
+    variants: Sequence[Variant], protocol: Protocol, limits: Mapping[str, float], limited: str, least: str, word: str
+) -> tuple[tuple[tuple[Cell, ...], ...], tuple[str, ...]]:
+    """Return a row and notes for each plain variant and limit: of what is within it, the candidate with the least."""
+    rows, notes = [], []
+    cost = attrgetter(least)
     for plain in (variant for variant in variants if variant.sparsify == "none"):
-        for share in SHARES:
-            allowed = [one for one in _candidates(plain, variants, protocol) if one.share <= share]
-            best, control = (min(some, key=lambda one: one.loss, default=None) for some in _parted(allowed))
-            rows.append((Cell(f"{_named(plain)}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
-            if control is not None and (best is None or control.loss < best.loss):
-                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is better")
-    notes += [*_caps(variants), *busy_variants(variants)]
-    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), tuple(notes))
+        candidates = _candidates(plain, variants, protocol)
+        for said, most in limits.items():
+            allowed = [one for one in candidates if getattr(one, limited) <= most]
+            best, control = (
+                min((one for one in allowed if bool(one.variant.control) == controls), key=cost, default=None)
+                for controls in (False, True)
+            )
+            rows.append((Cell(f"{_named(plain)}, {said}"), *_chosen(best)))
+            if control is not None and (best is None or cost(control) < cost(best)):
+                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is {word}")
+    return tuple(rows), (*notes, *_caps(variants), *busy_variants(variants))
 
 
 _OF_THIS_SWEEP = "of the arms of this sweep as they were run: nothing is interpolated"
@@ -211,14 +227,8 @@ _CHOSEN = tuple(
 )
 
 
-def _parted(candidates: Sequence[_Candidate]) -> tuple[list[_Candidate], list[_Candidate]]:
-    """Returns those that are no controls, and the controls."""
-    controls = [one for one in candidates if one.variant.control]
-    return [one for one in candidates if not one.variant.control], controls
-
-
 def _in_words(one: _Candidate) -> str:
-    return f"{one.variant.title}, {-one.loss:+.2f} dB at {100 * one.share:.0f} % of the Gaussians,"
+    return f"{one.variant.title}, {-one.loss:+.2f} dB at {one.share:.0f} % of the Gaussians,"
 
 
 def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
@@ -233,7 +243,7 @@ def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
 
     numbers = (
         number_cell(-best.loss, "{:+.2f}", runs),
-        number_cell(100 * best.share, "{:.0f}", runs),
+        number_cell(best.share, "{:.0f}", runs),
         mean("Gaussians", "{:,.0f}"),
         mean("MB", "{:.2f}"),
         mean("ms/frame", "{:.2f}", "frames"),
@@ -249,17 +259,6 @@ MIN_PAIRS = 3
 12.7 standard errors wide to each side."""
 
 
-@dataclass(frozen=True)
-class _Compared:
-    """A variant beside its plain one, over the scenes and seeds that both have."""
-
-    variant: Variant
-    gain: ConfidenceInterval
-    """dB, negative if the variant is worse."""
-    kept: float
-    """Per cent of the plain variant's Gaussians."""
-
-
 def summary_line(variants: Sequence[Variant], protocol: Protocol) -> tuple[str, ...]:
     """Return a sentence for each plain variant, then what limits them; nothing for one with too few pairs.
 
@@ -270,13 +269,13 @@ def summary_line(variants: Sequence[Variant], protocol: Protocol) -> tuple[str, 
     for plain in (variant for variant in variants if variant.sparsify == "none"):
         compared = [
             one
-            for variant in variants
-            if plain_of(variant, variants) is plain and (one := _compared(variant, plain, protocol))
+            for one in _candidates(plain, variants, protocol)
+            if one.variant is not plain and not one.variant.control and one.gain.n >= MIN_PAIRS
         ]
         if not compared:
             continue
-        smaller = [one for one in compared if one.gain.mean >= -LOSS and one.kept < 100]
-        best = min(smaller, key=lambda one: one.kept, default=None)
+        smaller = [one for one in compared if one.gain.mean >= -LOSS and one.share < 100]
+        best = min(smaller, key=lambda one: one.share, default=None)
         found.append(_sentence(plain, compared, best))
         wide += [best.variant.name] if best and best.gain.low is not None and best.gain.low < -LOSS else []
         held += [plain.name] if is_capped(plain) else []
@@ -289,17 +288,7 @@ def summary_line(variants: Sequence[Variant], protocol: Protocol) -> tuple[str, 
     return tuple(found)
 
 
-def _compared(variant: Variant, plain: Variant, protocol: Protocol) -> _Compared | None:
-    if variant is plain or variant.control:
-        return None
-    gain = paired(variant, plain, _held_out(protocol.psnr))
-    share = paired(variant, plain, "Gaussians", relative=True)
-    if gain is None or share is None or gain.n < MIN_PAIRS:
-        return None
-    return _Compared(variant, gain, 100 + share.mean)
-
-
-def _sentence(plain: Variant, compared: Sequence[_Compared], best: _Compared | None) -> str:
+def _sentence(plain: Variant, compared: Sequence[_Candidate], best: _Candidate | None) -> str:
     of = f"of {len(compared)} arms " if len(compared) > 1 else ""
     if best is None:
         nearest = max(compared, key=lambda one: one.gain.mean)
@@ -307,7 +296,7 @@ def _sentence(plain: Variant, compared: Sequence[_Compared], best: _Compared | N
     return f"{plain.name}: {of}the smallest within {LOSS:g} dB is {best.variant.name}, with {_numbers(best)}."
 
 
-def _numbers(one: _Compared) -> str:
+def _numbers(one: _Candidate) -> str:
     gain = one.gain
     interval = "" if gain.low is None else f" [{gain.low:+.2f}, {gain.high:+.2f}]"
-    return f"{one.kept:.0f} % of the Gaussians, {gain.mean:+.2f} dB{interval} of held-out PSNR, n = {gain.n}"
+    return f"{one.share:.0f} % of the Gaussians, {gain.mean:+.2f} dB{interval} of held-out PSNR, n = {gain.n}"
