@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sparsestreet.records.costs import COSTS, CostRecord, EffectGain
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.run import EffectDecision
-from sparsestreet.report.tables import ABSENT, BUSY, Cell, Grid, number_cell
+from sparsestreet.report.tables import ABSENT, BUSY, Cell, busy_words, Grid, number_cell
 from sparsestreet.report.variants import Unit, Variant, busy_variants, plain_of
 
 _CLOCK_OF = {"ms/frame": "frames", "train s": "training"} | dict.fromkeys(("seconds", "ms of a step"), "training")
@@ -68,10 +68,8 @@ def what_effects_cost(variants: Sequence[Variant]) -> Grid:
         "measured: frames and PSNR of the finished scene with the effect, less those without it; a scene that was "
         "trained without the effect would have made up for a part"
     ]
-    if busy := [
-        variant.name for variant in variants if _busy([COSTS.find(record.folder) for record in variant.records])
-    ]:
-        notes.append(f"{BUSY} times of a machine that was not quiet, compared with no other: {', '.join(busy)}")
+    busy = [variant.name for variant in variants if _busy([COSTS.find(record.folder) for record in variant.records])]
+    notes += busy_words(", ".join(busy))
     return Grid("effects", "What each effect costs and brings", _HEADER, tuple(rows), tuple(notes))
 
 

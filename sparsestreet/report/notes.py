@@ -1,7 +1,7 @@
 """The notes below a table: how its numbers are defined, and where runs differ."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from sparsestreet.metrics.definitions import LIDAR_REACH, Protocol
 from sparsestreet.records.run import CodeVersion, Machine
@@ -79,29 +79,28 @@ def _lidar(runs: Sequence[RunSummary]) -> list[str]:
 
 
 def _timing(runs: Sequence[RunSummary]) -> list[str]:
-    """Says where and with what ms/frame was measured."""
-    places = _places((run.latency.device, run.latency.threads, run.evaluated.machine) for run in runs)
-    said = [("ms/frame are not comparable, measured on: " if len(places) > 1 else "measured on ") + "; ".join(places)]
+    """Say where and with what ms/frame was measured."""
+    places = [(run.latency.device, run.latency.threads, run.evaluated.machine) for run in runs]
+    said = _places("ms/frame", "measured", places)
     if len({run.latency.protocol for run in runs}) > 1:
         said.append("ms/frame were taken with different numbers of renders; see each summary.json")
     return said + _commits("measured", [run.evaluated.source for run in runs])
 
 
 def _training(runs: Sequence[RunSummary]) -> list[str]:
-    """Says where train s was measured."""
-    places = _places((run.run.device, run.run.threads, run.run.machine) for run in runs)
-    said = [("train s are not comparable, trained on: " if len(places) > 1 else "trained on ") + "; ".join(places)]
-    return said + _commits("trained", [run.run.source for run in runs])
+    """Say where train s was measured."""
+    places = [(run.run.device, run.run.threads, run.run.machine) for run in runs]
+    return _places("train s", "trained", places) + _commits("trained", [run.run.source for run in runs])
 
 
-def _places(clocks: Iterable[tuple[str, int, Machine]]) -> list[str]:
-    """Returns what a time depends on besides the code: each device, number of threads and machine once."""
-    return sorted(
-        {
-            f"{device}, {threads} thread{'s' if threads != 1 else ''}, {host.cores} cores, torch {host.torch}"
-            for device, threads, host in clocks
-        }
-    )
+def _places(times: str, done: str, clocks: Sequence[tuple[str, int, Machine]]) -> list[str]:
+    """Say what times depend on besides the code: each device, number of threads and machine once."""
+    places = {
+        f"{device}, {threads} thread{'s' if threads != 1 else ''}, {host.cores} cores, torch {host.torch}"
+        for device, threads, host in clocks
+    }
+    apart = f"{times} are not comparable, " if len(places) > 1 else ""
+    return [f"{apart}{done} on: {'; '.join(sorted(places))}" if apart else f"{done} on {'; '.join(places)}"]
 
 
 def _commits(done: str, sources: Sequence[CodeVersion]) -> list[str]:
@@ -126,7 +125,7 @@ def _repeated_seeds(variants: Sequence[Repeats]) -> list[str]:
     """Names seeds that occur twice: such a run counts twice, but it is no independent repeat."""
     said = []
     for variant in variants:
-        times = Counter((run.run.scene, run.run.seed) for run in variant.runs)
+        times = Counter(_scenes_and_seeds(variant))
         twice = [f"seed {seed} {count} times" for (_, seed), count in sorted(times.items()) if count > 1]
         if twice:
             said.append(f"{variant.name}: {', '.join(twice)}; equal runs of one seed are no independent repeats")
@@ -134,19 +133,22 @@ def _repeated_seeds(variants: Sequence[Repeats]) -> list[str]:
 
 
 def _lacking_seeds(variants: Sequence[Repeats]) -> list[str]:
-    """Names variants that lack seeds which others have of a scene: seeds can differ by more than methods do."""
-    every = sorted({(run.run.scene, run.run.seed) for variant in variants for run in variant.runs})
+    """Name variants that lack seeds which others have of a scene: seeds can differ by more than methods do."""
+    every = sorted({unit for variant in variants for unit in _scenes_and_seeds(variant)})
     said = []
     for variant in variants:
-        own = {(run.run.scene, run.run.seed) for run in variant.runs}
+        own = set(_scenes_and_seeds(variant))
         lacking: dict[str, list[str]] = {}
         for scene, seed in every:
             if (scene, seed) not in own and scene in {scene for scene, _ in own}:
                 lacking.setdefault(scene, []).append(str(seed))
-        if lacking:
-            words = ", ".join(f"{scene} with seed {', '.join(seeds)}" for scene, seeds in lacking.items())
-            said.append(f"{variant.name} has no run of {words}: compare differences, not means")
+        words = ", ".join(f"{scene} with seed {', '.join(seeds)}" for scene, seeds in lacking.items())
+        said += [f"{variant.name} has no run of {words}: compare differences, not means"] if words else []
     return said
+
+
+def _scenes_and_seeds(variant: Repeats) -> list[tuple[str, int]]:
+    return [(run.run.scene, run.run.seed) for run in variant.runs]
 
 
 def _unfinished(variants: Sequence[Repeats]) -> list[str]:
@@ -170,14 +172,15 @@ def _scenes(variants: Sequence[Repeats]) -> list[str]:
 
 
 def _caps(variants: Sequence[Repeats]) -> list[str]:
-    """Names counts that a cap limited: they say little about what a scene needs, and their shares even less."""
-    said = []
-    for variant in variants:
-        caps = sorted({(node, cap) for run in variant.runs for node, cap in run.run.caps.items()})
-        reached = ", ".join(f"{node} reached its cap of {cap:,} Gaussians" for node, cap in caps)
-        if reached:
-            said.append(f"{CAPPED} {variant.name}: {reached}")
-    return said
+    """Name counts that a cap limited: they say little about what a scene needs, and their shares even less."""
+    found = {
+        variant.name: sorted({item for run in variant.runs for item in run.run.caps.items()}) for variant in variants
+    }
+    return [
+        f"{CAPPED} {name}: " + ", ".join(f"{node} reached its cap of {cap:,} Gaussians" for node, cap in caps)
+        for name, caps in found.items()
+        if caps
+    ]
 
 
 def _guards(variants: Sequence[Repeats]) -> str:

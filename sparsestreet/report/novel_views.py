@@ -8,7 +8,7 @@ import pandas as pd
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.renders import PRESETS
 from sparsestreet.report.frame import TRUTH, UNIT, by_unit, mean_over_scenes, shifts_of
-from sparsestreet.report.tables import BUSY, Cell, Grid, number_cell
+from sparsestreet.report.tables import BUSY, Cell, busy_words, Grid, number_cell
 from sparsestreet.report.tradeoffs import difference_cell, interval_over_scenes
 from sparsestreet.report.variants import Variant
 
@@ -73,8 +73,7 @@ def rendered_otherwise(variants: Sequence[Variant], protocol: Protocol) -> Grid 
         "one scene, the same held-out views; dB to exact: of the image against that of the same scene without cut-off "
         "and early stop; differences paired by scene and seed, with 95 % t intervals, bold where they exclude 0"
     ]
-    if busy := [variant.name for variant, records in recorded if _busy(records)]:
-        notes.append(f"{BUSY} times of a machine that was not quiet, compared with no other: {', '.join(busy)}")
+    notes += busy_words(", ".join(variant.name for variant, records in recorded if _busy(records)))
     return Grid("presets", "Trained one way, rendered another", tuple(header), tuple(rows), tuple(notes))
 
 

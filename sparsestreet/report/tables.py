@@ -232,11 +232,9 @@ def busy_note(named: Iterable[tuple[str, RunSummary]]) -> list[str]:
     named = list(named)
     busy = {what: sorted({name for name, run in named if not steady(run)}) for what, steady in CLOCKS.items()}
     said = [f"{what} of {', '.join(names)}" for what, names in busy.items() if names]
-    return busy_words(said)
+    return busy_words("; ".join(said))
 
 
-def busy_words(named: Sequence[str]) -> list[str]:
+def busy_words(said: str) -> list[str]:
     """Return the note that explains the mark of times; nothing where none has it."""
-    return (
-        [f"{BUSY} times of a machine that was not quiet, compared with no other: {'; '.join(named)}"] if named else []
-    )
+    return [f"{BUSY} times of a machine that was not quiet, compared with no other: {said}"] if said else []

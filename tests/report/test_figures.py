@@ -23,7 +23,7 @@ from sparsestreet.report.figures import (
     PARETO_COSTS,
     _counts,
     _frame_costs,
-    _paint_among,
+    _paint,
     counts_over_time,
     frame_waterfall,
     front,
@@ -455,10 +455,10 @@ def test_without_held_out_views_there_is_none(tmp_path):
 
 def test_arms_of_one_method_differ_in_color_and_those_of_several_by_method():
     one = variants([record(make_summary(label)) for label in ("a", "a+paper")])
-    assert len({_paint_among(variant, one) for variant in one}) == 2
+    assert len({_paint(styles(one), variant) for variant in one}) == 2
     several = [*one, *variants([record(make_summary("b"))])]
-    assert len({_paint_among(variant, several) for variant in one}) == 1
-    assert len({_paint_among(variant, several) for variant in several}) == 2
+    assert len({_paint(styles(several), variant) for variant in one}) == 1
+    assert len({_paint(styles(several), variant) for variant in several}) == 2
 
 
 def figure_of(runs, tmp_path, monkeypatch):
