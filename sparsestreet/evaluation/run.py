@@ -20,12 +20,12 @@ from sparsestreet.pictures.images import KINDS, Picture, draw_lidar_end, error_p
 from sparsestreet.pictures.sheets import Legend, picture_sheet
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.costs import EffectGain, update_costs
-from sparsestreet.records.provenance import this_machine, this_source
-from sparsestreet.records.renders import NOVEL, PRESETS
-from sparsestreet.records.run import RunDescription
+from sparsestreet.records.run import RunDescription, this_machine, this_source
 from sparsestreet.records.summary import (
     HELD_OUT,
     LATENCY,
+    NOVEL,
+    PRESETS,
     QUALITY,
     SUMMARY,
     TRAINING,

@@ -26,8 +26,8 @@ from sparsestreet.pictures.plots import count_curves, marks
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.curves import LEDGER
 from sparsestreet.records.summary import HELD_OUT
+from sparsestreet.report.collect import by_scene
 from sparsestreet.report.costs import curves_of, curves_of_runs, mean_curve
-from sparsestreet.report.frame import by_scene
 from sparsestreet.report.variants import Variant, plain_of
 
 T = TypeVar("T")

@@ -8,9 +8,15 @@ from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.records.run import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import write_atomically
 from sparsestreet.report.collect import RunRecord, check_definitions, collect
-from sparsestreet.report.costs import effects_alike, time_to_quality, what_effects_cost, what_variants_cost
+from sparsestreet.report.costs import (
+    beside_the_path,
+    effects_alike,
+    rendered_otherwise,
+    time_to_quality,
+    what_effects_cost,
+    what_variants_cost,
+)
 from sparsestreet.report.figures import PARETO_COSTS, counts_over_time, frame_waterfall, held_out_over_time, pareto
-from sparsestreet.report.novel_views import beside_the_path, rendered_otherwise
 from sparsestreet.report.page import Page, comparison_data, html
 from sparsestreet.report.paper import paper_table
 from sparsestreet.report.tables import Grid, comma_separated, latex, markdown

@@ -8,7 +8,7 @@ import pandas as pd
 
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.summary import HELD_OUT
-from sparsestreet.report.frame import by_scene, mean_over_scenes
+from sparsestreet.report.collect import by_scene, mean_over_scenes
 from sparsestreet.report.tables import (
     BUSY,
     CAPPED,

@@ -19,8 +19,7 @@ from sparsestreet.records.configuration import (
     without,
 )
 from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.frame import CLIP_KEYS, by_unit, clip_of, mean_over_scenes, run_frame
+from sparsestreet.report.collect import CLIP_KEYS, RunRecord, by_unit, clip_of, mean_over_scenes, run_frame
 from sparsestreet.report.tables import BUSY, CLOCKS, busy_note
 
 LOG_KEYS = ("data.log.*",)

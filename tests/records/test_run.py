@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.records import provenance
-from sparsestreet.records.provenance import processor_name, this_machine, this_source
-from sparsestreet.records.run import CodeVersion, Machine
+from sparsestreet.records import run
+from sparsestreet.records.run import CodeVersion, Machine, processor_name, this_machine, this_source
 
 
 def git(folder, *arguments):
@@ -42,12 +41,12 @@ def test_machine_is_described():
 
 
 def test_every_word_of_a_machine_is_its_own(tmp_path, monkeypatch):
-    monkeypatch.setattr(provenance, "processor_name", lambda: "a processor")
+    monkeypatch.setattr(run, "processor_name", lambda: "a processor")
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: {0, 3, 5}, raising=False)
     monkeypatch.setattr(platform, "system", lambda: "Plan 9")
     monkeypatch.setattr(platform, "machine", lambda: "m68k")
     monkeypatch.setattr(platform, "python_version", lambda: "3.99")
-    monkeypatch.setattr(provenance.metadata, "version", lambda package: f"{package} 7")
+    monkeypatch.setattr(run.metadata, "version", lambda package: f"{package} 7")
     assert this_machine() == Machine("a processor", 3, "Plan 9 m68k", "3.99", "torch 7")
     monkeypatch.delattr(os, "sched_getaffinity", raising=False)
     monkeypatch.setattr(os, "cpu_count", lambda: 12)

@@ -14,12 +14,13 @@ from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.records.costs import STEP_PHASES, StepPhase
 from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, LOGGED, CountChange, HeldOutLook
 from sparsestreet.records.file import JsonFile
-from sparsestreet.records.renders import NOVEL, PRESETS, NovelRecord, NovelShift, PresetRecord, RenderedAs
 from sparsestreet.records.run import FAILURE, RUN, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError, significant, write_atomically
 from sparsestreet.records.summary import (
     HELD_OUT,
     LATENCY,
+    NOVEL,
+    PRESETS,
     QUALITY,
     SUMMARY,
     TRAINING,
@@ -28,8 +29,12 @@ from sparsestreet.records.summary import (
     GuardCounts,
     Latency,
     MetricSummary,
+    NovelRecord,
+    NovelShift,
     Percentiles,
+    PresetRecord,
     RegionQuality,
+    RenderedAs,
     camera_means,
     clock_rows,
     summarize,

@@ -7,7 +7,7 @@ from scipy import stats
 
 from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.summary import HELD_OUT, MetricSummary
-from sparsestreet.report.frame import run_frame
+from sparsestreet.report.collect import run_frame
 from sparsestreet.report.tables import t_interval
 from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired, summary_line
 from sparsestreet.report.variants import variants
