@@ -111,28 +111,6 @@ def test_a_lane_is_changed_smoothly():
     assert shifted(path[:1], 3.0, gradually=True)[0][0].camera.position.equal(path[0][0].camera.position)
 
 
-def test_a_path_at_its_own_rate_is_itself():
-    path = recorded(street_views())
-    assert resampled(path, STEP) == path
-
-
-def test_between_two_instants_lies_the_middle():
-    path = recorded(street_views())
-    finer = resampled(path, STEP / 2)
-    assert [rig[0].time for rig in finer] == [index / 8 for index in range(9)]
-    assert finer[::2] == path
-    for before, view, after in zip(path[1], finer[3], path[2], strict=True):
-        assert (view.frame_index, view.camera_index) == (None, before.camera_index)
-        middle = (before.camera.position + after.camera.position) / 2
-        torch.testing.assert_close(view.camera.position, middle, rtol=0, atol=2e-6)
-        # Half of 3 degrees, about the axis that the whole turn is about.
-        forward = view.camera.camera_from_world[2, :3]
-        for end in (before, after):
-            cosine = float(forward @ end.camera.camera_from_world[2, :3])
-            assert math.degrees(math.acos(min(cosine, 1.0))) == pytest.approx(1.5, abs=0.02)  # float32 near cos = 1
-        assert torch.equal(view.camera.intrinsics, before.camera.intrinsics)
-
-
 def test_a_quarter_of_the_way_lies_nearer_to_where_it_begins():
     """1 m and 3 degrees a frame, the same step everywhere."""
     finer = resampled(recorded(street_views()), STEP / 4)

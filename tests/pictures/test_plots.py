@@ -12,7 +12,6 @@ from sparsestreet.pictures.images import Dots, Marked, Places
 from sparsestreet.pictures.plots import draw_evidence, draw_history, plot_counts, plot_psnr, plot_runs
 from sparsestreet.records.curves import LEDGER, MASK, PRUNING, CountChange
 from sparsestreet.records.run import RUN
-from sparsestreet.records.strict_json import RecordError, write_atomically
 from sparsestreet.training.callbacks import mask_training, pruning
 from tests.evaluation.frames import make_run
 
@@ -54,29 +53,6 @@ def test_counts_with_events(tmp_path, drawn):
     assert legend_of(drawn[0]) == ["background (400)", "rigid (50)", "prune", "mask"]
     with pytest.raises(ValueError, match="counts of 'rigid' have 1 samples, steps 2"):
         plot_counts(path, [0, 1], {"rigid": [3]})
-
-
-def test_plots_of_nothing_are_empty_not_errors(tmp_path, drawn):
-    plot_counts(tmp_path / "counts.png", [], {"sky": []})
-    plot_psnr(tmp_path / "psnr.png", {})
-    assert len(drawn) == 2
-
-
-def test_psnr_curves(tmp_path, drawn):
-    plot_psnr(tmp_path / "psnr.png", {"plain": ([0, 5], [10.0, 20.0])}, [(3, "mask")])
-    line, mark, _ = drawn[0].axes[0].lines
-    assert list(line.get_ydata()) == [10.0, 20.0]
-    assert list(mark.get_xdata()) == [3, 3]
-    assert legend_of(drawn[0]) == ["plain", "mask"]
-
-
-def test_runs_are_points_in_the_color_of_their_name(tmp_path, drawn):
-    plot_runs(tmp_path / "runs.png", {"plain": [(1000, 25.0), (1000, 26.0)], "ours": [(310, 24.0)]})
-    plain, ours = drawn[0].axes[0].collections
-    assert plain.get_offsets().tolist() == [[1000, 25], [1000, 26]]
-    assert ours.get_offsets().tolist() == [[310, 24]]
-    assert plain.get_facecolor().tolist() != ours.get_facecolor().tolist()
-    assert legend_of(drawn[0]) == ["plain (n=2)", "ours (n=1)"]
 
 
 @pytest.mark.lengthy
@@ -140,6 +116,8 @@ def test_events_of_one_name_share_a_style_behind_the_curves(tmp_path, drawn):
 def test_a_plot_without_a_name_has_no_legend(tmp_path, drawn):
     plot_psnr(tmp_path / "deep" / "psnr.png", {})
     assert drawn[0].axes[0].get_legend() is None
+    plot_counts(tmp_path / "counts.png", [], {"sky": []})  # of no step: empty, not an error
+    assert len(drawn) == 2
 
 
 CHANGES = [
@@ -214,32 +192,6 @@ def test_the_pictures_are_drawn(tmp_path):
     LEDGER.write(tmp_path, CHANGES)
     draw_history(tmp_path)
     assert (tmp_path / "curves" / "counts.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_the_ledger_is_read_as_it_was_written(tmp_path):
-    path = LEDGER.path(tmp_path)
-    LEDGER.write(tmp_path, CHANGES)
-    assert path == tmp_path / "records" / "counts.csv"
-    assert path.read_text().splitlines()[:2] == ["step,node,before,after,reason", "0,background,0,100,seeds"]
-    assert LEDGER.read(tmp_path) == CHANGES
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("step,node\n", r"counts\.csv: the header is"),
-        ("", r"counts\.csv: the header is"),
-        ("step,node,before,after,reason\n0,a,0,ten,seeds\n", r"counts\.csv, line 2: .*ten"),
-        (
-            "step,node,before,after,reason\n0,a,0,1,seeds\n1,a,0\n",
-            r"counts\.csv, line 3: 3 cells, expected 5; train the run again",
-        ),
-    ],
-)
-def test_a_malformed_ledger_names_file_and_line(tmp_path, text, message):
-    write_atomically(LEDGER.path(tmp_path), text)
-    with pytest.raises(RecordError, match=message):
-        LEDGER.read(tmp_path)
 
 
 def test_a_curve_reaches_the_last_step_and_says_that_nothing_was_held_out(tmp_path, drawn_history):

@@ -40,14 +40,6 @@ def test_round_trip(tmp_path):
     assert COSTS.read(tmp_path) == MEASURED
 
 
-def test_another_format_is_named(tmp_path):
-    path = COSTS.path(tmp_path)
-    COSTS.write(tmp_path, MEASURED)
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 0}))
-    with pytest.raises(RecordError, match="format 0, this version reads 1: train the run again"):
-        COSTS.read(tmp_path)
-
-
 @pytest.mark.parametrize("wall", [97.0, 103.0])
 def test_phases_that_are_not_the_wall_clock_are_refused(tmp_path, wall):
     path = COSTS.path(tmp_path)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from sparsestreet.metrics.definitions import DEFINITIONS
-from sparsestreet.records.costs import STEP_PHASES, StepPhase
+from sparsestreet.records.costs import COSTS, STEP_PHASES, CostRecord, StepPhase
 from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, LOGGED, CountChange, HeldOutLook
 from sparsestreet.records.file import JsonFile
 from sparsestreet.records.run import FAILURE, RUN, FailedRun, read_failures
@@ -57,6 +57,11 @@ IMAGES = [
         },
     ),
 ]
+
+
+SHIFT = NovelShift(offset=-1.5, views=6, distances={"fid": 42.5}, truth={"psnr_human": 20.5}, true_views=5)
+NEXT_TO_IT = NovelRecord(command="n", ramp=True, real_views=7, absent="no weights", shifts=(SHIFT,))
+NO_COSTS = CostRecord(phases={}, step_ms={}, passes={}, frame_ms={}, nodes={}, effects={})
 
 
 def test_summary_round_trip(tmp_path):
@@ -116,8 +121,10 @@ def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
     [
         (RUN, make_run(), "format 0, this version reads 2: train the run again"),
         (SUMMARY, make_summary(), "format 0, this version reads 4: evaluate again"),
+        (NOVEL, NEXT_TO_IT, "format 0, this version reads 2: evaluate again with novel"),
+        (COSTS, NO_COSTS, "format 0, this version reads 1: train the run again"),
     ],
-    ids=["run", "summary"],
+    ids=["run", "summary", "novel", "cost"],
 )
 def test_another_format_is_named_before_its_keys(tmp_path, file, value, remedy):
     path = file.path(tmp_path)
@@ -349,9 +356,6 @@ def test_clocks_are_of_all_gaussians_or_of_masked_and_removed_ones():
             Latency(clocks(1.0), broken, 20, 6, "d", 2, NOISE)
 
 
-SHIFT = NovelShift(offset=-1.5, views=6, distances={"fid": 42.5}, truth={"psnr_human": 20.5}, true_views=5)
-
-
 def check_written(run: Path, file: JsonFile[Any], name: str, record: Any) -> None:
     file.write(run, record)
     assert (run / name).is_file()
@@ -359,25 +363,26 @@ def check_written(run: Path, file: JsonFile[Any], name: str, record: Any) -> Non
 
 
 def test_records_beside_the_summary_are_read_as_they_were_written(tmp_path):
-    novel = NovelRecord(command="n", ramp=True, real_views=7, absent="no weights", shifts=(SHIFT,))
     way = RenderedAs(
         preset="fast", trained=True, quality={"psnr_full": 25.5}, psnr_to_exact=50.5, frame_ms=7.5, repeats=9
     )
     presets = PresetRecord(command="p", device="d", threads=3, views=4, noise=NOISE, rendered=(way,))
     failed = FailedRun(label="a+b", seed=4, command="c", error="e", trace="t")
-    check_written(tmp_path / "run", NOVEL, "records/novel.json", novel)
+    check_written(tmp_path / "run", NOVEL, "records/novel.json", NEXT_TO_IT)
     check_written(tmp_path / "run", PRESETS, "records/presets.json", presets)
     check_written(tmp_path / "run", FAILURE, "failed.json", failed)
     assert read_failures(tmp_path) == [(tmp_path / "run", failed)]
 
 
-@pytest.mark.parametrize("region", ["full", "human", "vehicle"])
-def test_a_truth_has_three_regions_alone(region):
-    assert NovelShift(offset=1.0, views=1, distances={}, truth={f"psnr_{region}": 1.0}, true_views=1)
-    with pytest.raises(
-        ValueError, match="truth holds psnr_near, psnr_sky, expected psnr_full, psnr_human, psnr_vehicle"
-    ):
-        NovelShift(offset=1.0, views=1, distances={}, truth={"psnr_sky": 1.0, "psnr_near": 2.0}, true_views=1)
+def test_a_truth_has_known_metrics_alone(tmp_path):
+    """The error names the place in the file."""
+    with pytest.raises(ValueError, match="truth holds psnr_near, psnr_sky, expected psnr_full, psnr_human, psnr_veh"):
+        dataclasses.replace(SHIFT, truth={"psnr_sky": 1.0, "psnr_near": 2.0})
+    NOVEL.write(tmp_path, NEXT_TO_IT)
+    path = NOVEL.path(tmp_path)
+    path.write_text(path.read_text().replace("psnr_human", "psnr_sky"))
+    with pytest.raises(RecordError, match=r"novel\.json: shifts\[0\]: truth holds psnr_sky, expected psnr_full, "):
+        NOVEL.read(tmp_path)
 
 
 def test_what_training_logged_keeps_every_column(tmp_path):

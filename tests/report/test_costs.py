@@ -1,6 +1,5 @@
 """What each variant costs, in absolute numbers."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,14 @@ from sparsestreet.metrics.definitions import DRIVESTUDIO, STRICT
 from sparsestreet.records.costs import EffectGain, update_costs
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.run import EffectDecision, RunDescription
-from sparsestreet.records.strict_json import RecordError
-from sparsestreet.records.summary import NOVEL, PRESETS, PresetRecord, RenderedAs
+from sparsestreet.records.summary import PRESETS, PresetRecord, RenderedAs
 from sparsestreet.report.collect import RunRecord, collect, shifts_of
 from sparsestreet.report.costs import (
     TRUTH,
     QualityCurve,
     beside_the_path,
     curves_of,
-    mean_curve,
     rendered_otherwise,
-    seconds_to,
     time_to_quality,
     what_effects_cost,
     what_variants_cost,
@@ -31,18 +27,6 @@ from sparsestreet.report.variants import variants
 from tests.evaluation.frames import NOISE, make_summary
 from tests.records.novel import write_beside
 from tests.report.sweep_folder import record, write_sweep
-
-
-def test_means_over_the_runs_of_an_arm(tmp_path):
-    """Forward is all of a step that is neither backward nor the optimizer: 1 + 2 + 0.5 + 0.25 + 0.125 ms."""
-    grid = what_variants_cost(variants(collect([write_sweep(tmp_path)])))
-    names = [" ".join(heading).strip() for heading in grid.header]
-    removal = dict(zip(names, (cell.text for cell in grid.rows[1]), strict=True))
-    assert (removal["arm"], removal["n"], removal["Gaussians"]) == ("streetgs+removal", "3", "2,510")
-    assert (removal["ms/frame"], removal["train s"], removal["seconds pruning"]) == ("10.00", "100.0", "0.2")
-    steps = [removal[f"ms of a step {part}"] for part in ("forward", "backward", "optimizer")]
-    assert steps == ["3.9", "4.0", "0.5"]
-    assert "peak MB host" not in removal  # no run recorded it
 
 
 def test_without_cost_records_the_summary_is_left(tmp_path):
@@ -136,17 +120,6 @@ def test_records_without_a_plan_give_no_row(tmp_path):
     assert what_effects_cost(variants([RunRecord(tmp_path, make_summary("m"))])).rows == ()
 
 
-def test_the_first_look_that_is_good_enough():
-    curve = QualityCurve((10.0, 20.0, 30.0), (20.0, 22.0, 21.5))
-    assert seconds_to(curve, 21.5) == 20.0  # nothing between two looks
-    assert seconds_to(curve, 22.1) is None
-
-
-def test_the_mean_is_over_looks_that_all_curves_have():
-    curves = [QualityCurve((10.0, 20.0), (20.0, 22.0)), QualityCurve((12.0, 24.0, 36.0), (21.0, 24.0, 25.0))]
-    assert mean_curve(curves) == QualityCurve((11.0, 22.0), (20.5, 23.0))
-
-
 def test_runs_of_one_scene_and_seed_are_their_mean(tmp_path):
     """Runs that were trained on all views are in no mean with them."""
     runs = []
@@ -175,16 +148,13 @@ def test_the_last_look_of_the_plain_run_counts_not_its_best(tmp_path):
     assert [cell.text for cell in grid.rows[0][1:]] == ["10.0 s", "10.0 s", "20.0 s"]
 
 
-def test_no_curve_no_table(tmp_path):
-    assert time_to_quality(variants(collect([write_sweep(tmp_path, curves=False)]))) is None
-
-
-def test_a_malformed_curve_is_named(tmp_path):
-    run = write_sweep(tmp_path) / "streetgs_seed0"
-    path = HELD_OUT_CURVE.path(run)
-    path.write_text(path.read_text() + "soon,5,20.0,,\n")
-    with pytest.raises(RecordError, match=r"held_out\.csv, line 6: could not convert .*soon.*; train the run again"):
-        time_to_quality(variants(collect([tmp_path])))
+@pytest.mark.parametrize(
+    "table",
+    [time_to_quality, beside_the_path, lambda found: rendered_otherwise(found, DRIVESTUDIO)],
+    ids=["curves", "beside the path", "presets"],
+)
+def test_none_recorded_no_table(tmp_path, table):
+    assert table(variants(collect([write_sweep(tmp_path, curves=False)]))) is None
 
 
 def test_both_sides_count_alike(tmp_path):
@@ -245,27 +215,6 @@ def test_table_4_holds_the_inception_distance_alone(tmp_path):
     assert paper_table(again, [], DRIVESTUDIO, "table4_novel").rows[0][2].text == "-"
 
 
-def test_none_recorded_no_table(tmp_path):
-    assert beside_the_path(variants(collect([write_sweep(tmp_path)]))) is None
-
-
-def test_what_a_record_lacks_is_named(tmp_path):
-    write_beside(tmp_path, {1.0: 40.0}, psnr=20.0)
-    path = NOVEL.path(tmp_path)
-    entries = json.loads(path.read_text())
-    (shift,) = entries["shifts"]
-    path.write_text(json.dumps(entries | {"shifts": [shift | {"truth": {"psnr_sky": 20.0}}]}))
-    with pytest.raises(RecordError, match=r"novel\.json: shifts\[0\]: truth holds psnr_sky, expected psnr_full, "):
-        shifts_of(tmp_path)
-    del shift["truth"]
-    path.write_text(json.dumps(entries | {"shifts": [shift]}))
-    with pytest.raises(RecordError, match=r"novel\.json: shifts\[0\]: NovelShift lacks the keys \['truth'\]"):
-        shifts_of(tmp_path)
-    path.write_text(json.dumps(entries | {"format": 1}))
-    with pytest.raises(RecordError, match=r"format 1, this version reads 2: evaluate again with novel"):
-        shifts_of(tmp_path)
-
-
 def write_rendered(run: Path, loss: float) -> None:
     """As it was trained (30 dB, 20 ms) and faster, for so many dB."""
     rendered = tuple(
@@ -281,22 +230,6 @@ def write_rendered(run: Path, loss: float) -> None:
     )
     made = PresetRecord(command="c", device="cpu: x", threads=1, views=3, noise=NOISE, rendered=rendered)
     PRESETS.write(run, made)
-
-
-def test_a_row_for_each_arm_and_preset(tmp_path):
-    """Losses of 0.1, 0.2 and 0.3 dB: mean 0.2, half width of the t interval 4.3027 x 0.1 / sqrt(3) = 0.2484."""
-    sweep = write_sweep(tmp_path)
-    for seed in range(3):
-        write_rendered(sweep / f"streetgs_seed{seed}", 0.1 * (seed + 1))
-    found = variants(collect([sweep]))
-    grid = rendered_otherwise(found, DRIVESTUDIO)
-    texts = [[cell.text for cell in row] for row in grid.rows]
-    assert texts == [
-        ["streetgs", "default, as trained", "3", "30.00", "-", "-", "-", "-", "-", "50.0", "20.00"],
-        ["streetgs", "fast", "3", "29.80", "-0.20 [-0.45, +0.05]", "-", "-", "-", "-", "49.8", "12.00"],
-    ]
-    assert not any("quiet" in note for note in grid.notes)
-    assert rendered_otherwise(found, STRICT).rows[1][3].text == "-"  # its metric was not recorded
 
 
 def test_arms_of_one_label_are_told_apart_by_how_they_were_trained(tmp_path):
@@ -326,10 +259,6 @@ def test_renders_of_one_scene_and_seed_are_their_mean(tmp_path, splits, expected
     default, fast = rendered_otherwise(variants(runs), DRIVESTUDIO).rows
     assert [cell.text for cell in fast[2:5]] == expected
     assert default[1].text == "default, as trained"
-
-
-def test_none_recorded_no_table_presets(tmp_path):
-    assert rendered_otherwise(variants(collect([write_sweep(tmp_path)])), DRIVESTUDIO) is None
 
 
 @pytest.mark.parametrize("protocol", [DRIVESTUDIO, STRICT])

@@ -30,7 +30,6 @@ from sparsestreet.report.figures import (
     held_out_over_time,
     panels,
     pareto,
-    short,
     styles,
     time_figure,
     write_svg,
@@ -46,26 +45,9 @@ def test_the_front_is_what_nothing_beats():
     assert front(points) == [(1.0, 20.0), (2.0, 22.0), (4.0, 23.0)]
 
 
-def test_short_numbers():
-    assert [short(value) for value in (0.5, 200.0, 12_000.0, 1.5e6)] == ["0.5", "200", "12k", "1.5M"]
-
-
 @pytest.fixture
 def found(tmp_path):
     return variants(collect([write_sweep(tmp_path / "sweep", failed=False)]))
-
-
-@pytest.mark.lengthy
-def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
-    path = tmp_path / "pareto.svg"
-    assert pareto(found, DRIVESTUDIO, PARETO_COSTS[0], path)
-    text = path.read_text()
-    titles = [name for name in ("full image", "people", "vehicles") if f">{name}<" in text]
-    assert titles == ["full image", "vehicles"]  # no run measured people
-    # 3 runs and a mean, of a plain, a pruned and a grey variant, in 2 panels.
-    assert [len(re.findall(rf"<use [^>]*fill: {paint}", text, re.I)) for paint in (COLORS[0], COLORS[2])] == [8, 8]
-    assert len(re.findall(rf"<use [^>]*stroke: {GREY}", text)) >= 2 * 4
-    assert "control: random" in text
 
 
 UNEQUAL = {
@@ -113,13 +95,6 @@ def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     assert (tmp_path / "once" / "again" / "a.svg").read_text() == one
 
 
-@pytest.mark.lengthy
-def test_figures_over_time(found, tmp_path):
-    for draw, word in ((held_out_over_time, "training seconds"), (counts_over_time, "step"), (frame_waterfall, "sky")):
-        assert draw(found, tmp_path / "some.svg")
-        assert word in (tmp_path / "some.svg").read_text()
-
-
 def test_a_bar_is_the_mean_over_runs(tmp_path):
     runs = []
     for seed, ms in enumerate((1.0, 4.0)):
@@ -160,13 +135,6 @@ def test_every_run_has_a_line(tmp_path, monkeypatch):
     assert len(drawn[0].axes[0].get_lines()) == 2
 
 
-def test_what_was_not_recorded_is_not_drawn(tmp_path):
-    found = variants(collect([write_sweep(tmp_path / "sweep", curves=False)]))
-    for draw in (held_out_over_time, frame_waterfall):
-        assert not draw(found, tmp_path / "some.svg")
-    assert not (tmp_path / "some.svg").exists()
-
-
 def test_costs_of_another_format_are_named(found, tmp_path):
     path = found[0].records[0].folder / "records" / "cost.json"
     path.write_text("{}")
@@ -178,8 +146,7 @@ def test_costs_of_another_format_are_named(found, tmp_path):
 def canvas(monkeypatch):
     """The figures that would have been written, by the name of their file."""
     drawn = {}
-    for module in (figures, figures):
-        monkeypatch.setattr(module, "write_svg", lambda figure, path, says=None: drawn.update({path.name: figure}))
+    monkeypatch.setattr(figures, "write_svg", lambda figure, path, says=None: drawn.update({path.name: figure}))
     return drawn
 
 
@@ -346,17 +313,6 @@ def test_figures_are_named_and_what_is_absent_is_said(tmp_path):
         assert svg == (tmp_path / f"pareto_{cost[0]}.svg").read_text()
 
 
-def test_panels_are_as_large_as_they_are_asked_to_be(canvas, tmp_path):
-    drawn = panels(1), panels(3), panels(2, 4.6, 4.0)
-    sizes = [figure.get_size_inches().tolist() for figure, _ in drawn]
-    assert sizes == [pytest.approx(size) for size in ((3.2, 3.4), (9.6, 3.4), (9.2, 4.0))]
-    assert [len(axes) for _, axes in drawn] == [1, 3, 2]
-    for name in ("a", "b"):
-        update_costs(tmp_path / name, nodes={"road": NodeCost(10, 0.1, 4.0, 3.0)})
-    frame_waterfall(variants([record(make_summary(name), str(tmp_path / name)) for name in "ab"]), tmp_path / "w.svg")
-    assert canvas["w.svg"].get_size_inches().tolist() == pytest.approx([7.4, 1.1 + 0.34 * 2])
-
-
 def test_marks_say_what_they_are(found, tmp_path):
     """Three streets: a run each, and a mean, in the order in which they are drawn; names of groups are not left."""
     assert pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "a.svg")
@@ -437,14 +393,6 @@ def test_names_of_bars_do_not_run_into_each_other(tmp_path, canvas):
     boxes = [text.get_window_extent() for text in figure.axes[0].get_yticklabels()]
     assert len(boxes) == 3  # two of the runs are of one variant
     assert not any(one.overlaps(other) for index, one in enumerate(boxes) for other in boxes[:index])
-
-
-@pytest.mark.lengthy
-@pytest.mark.parametrize("curves", [True, False])
-def test_it_is_written_with_and_without_curves(tmp_path, curves):
-    found = variants(collect([write_sweep(tmp_path / "sweep", curves=curves)]))
-    time_figure(found, DRIVESTUDIO, tmp_path / "docs" / "figures" / "time.png")
-    assert (tmp_path / "docs" / "figures" / "time.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_without_held_out_views_there_is_none(tmp_path):

@@ -54,10 +54,6 @@ def test_every_link_has_its_place(page):
     assert "commit</dt><dd>0123456789abcdef" in text
 
 
-def test_what_failed_stands_escaped(page):
-    assert "streetgs+paper, seed 0: no &lt;memory&gt;" in page.read_text()
-
-
 def test_a_failed_folder_with_an_old_record_is_no_run(tmp_path):
     sweep = write_sweep(tmp_path, failed=False)
     (sweep / "streetgs+removal_seed0" / "failed.json").write_text(

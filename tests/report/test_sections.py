@@ -14,7 +14,7 @@ from sparsestreet.records.run import CodeVersion
 from sparsestreet.records.summary import HELD_OUT, Evaluation, MetricSummary
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.sections import section_tables, sections, sections_markdown, size_figure
-from sparsestreet.report.tables import Spread, spread
+from sparsestreet.report.tables import Spread
 from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary
 from tests.report.sweep_folder import record
 from tests.typed import as_a
@@ -61,25 +61,6 @@ def test_rows_hold_mean_spread_and_number_of_runs():
     assert found["Gaussians"].mean == pytest.approx((400 / 1200 + 400 / 1600) / 2 * 100)  # per cent kept
     assert found["ms/frame"].mean == pytest.approx((50 + 75) / 2)
     assert [row.runs for row in section.rows] == ["n=2 (seed 0,1)"] * 3
-
-
-def test_two_runs_that_differ_in_one_option_stand_apart():
-    (section,) = sections(
-        records(
-            make_summary("streetgs+removal", psnr=30.0, config={"schedule.removal_db": 0.1}),
-            make_summary("streetgs+removal", psnr=31.0, config={"schedule.removal_db": 0.2}),
-        )
-    )
-    assert [(row.label, row.n, row.cells[0].mean) for row in section.rows] == [
-        ("streetgs+removal schedule.removal_db=0.1", 1, 30.0),
-        ("streetgs+removal schedule.removal_db=0.2", 1, 31.0),
-    ]
-
-
-def test_three_repeats_are_one_row():
-    (section,) = sections(records(*(make_summary("m", seed, psnr=20.0 + seed) for seed in (2, 0, 1))))
-    (row,) = section.rows
-    assert (row.n, row.runs, row.cells[0]) == (3, "n=3 (seed 0,1,2)", Spread(21.0, 1.0, 3))
 
 
 def test_only_shared_seeds_are_paired():
@@ -301,12 +282,6 @@ def test_two_meanings_of_one_metric_do_not_meet_in_a_table():
         sections(records(first, second))
 
 
-def test_spread():
-    assert spread([]) is None
-    assert spread([3.0]) == Spread(3.0, None, 1)
-    assert spread([1.0, 2.0, 6.0]).sd == pytest.approx(7**0.5)
-
-
 def test_a_time_of_a_busy_machine_is_marked_and_compared_with_no_other():
     """The plain training of seed 0 was disturbed, and all frames of ours. Left: 100 s of 400 s with seed 1."""
     found = records(
@@ -399,12 +374,6 @@ def test_a_few_methods_fit_a_terminal_of_80_characters():
     assert "…" not in text
     assert "mean ± sample sd over runs; n=1 has no spread and proves nothing below the noise" in text  # its whole width
     assert text.count("┏") == 1
-
-
-def test_square_brackets_are_no_markup():
-    text = printed(records(*(make_summary("m", config={"nodes": [name]}) for name in ("red", "blue"))), 200)
-    assert 'nodes=["red"]' in text
-    assert 'nodes=["blue"]' in text
 
 
 SWEEP = records(*(make_summary("streetgs+removal", config={"schedule.removal_db": value}) for value in range(6)))

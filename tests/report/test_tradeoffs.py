@@ -24,14 +24,6 @@ def by_heading(grid, row):
     return {heading: cell for (_, heading), cell in zip(grid.header, row, strict=True)}
 
 
-def test_pairs_are_of_a_scene_and_a_seed(found):
-    plain, removal, _ = found
-    loss = paired(removal, plain, "held_out psnr_full")
-    # -0.2, -0.3, -0.4: t(2) = 4.303, sd 0.1
-    assert loss.mean == pytest.approx(-0.3)
-    assert loss.high - loss.mean == pytest.approx(4.303 * 0.1 / 3**0.5, abs=1e-3)
-
-
 def test_seeds_of_one_scene_are_the_pairs_else_scenes_are():
     runs = {
         ("plain", "a", 0): 20.0, ("plain", "a", 1): 21.0, ("plain", "b", 0): 30.0,
@@ -83,22 +75,6 @@ def test_an_arm_without_its_plain_run_is_named():
     grid = differences(variants([record(make_summary("plain+removal"))]), DRIVESTUDIO)
     assert not grid.rows
     assert "to compare with: plain+removal" in grid.notes[-1]
-
-
-def test_the_smallest_arm_of_a_quality(found):
-    chosen = {row[0].text: by_heading(grid, row) for grid in [matched_quality(found, DRIVESTUDIO)] for row in grid.rows}
-    assert chosen["streetgs, at most 0.1 dB"]["arm"].text == "streetgs"
-    assert chosen["streetgs, at most 0.5 dB"]["arm"].text == "streetgs+removal"
-    assert chosen["streetgs, at most 0.5 dB"]["Gaussians"].text == "2,510"
-
-
-def test_the_best_arm_of_a_budget(found):
-    grid = matched_budget(found, DRIVESTUDIO)
-    chosen = {row[0].text: by_heading(grid, row) for row in grid.rows}
-    assert chosen["streetgs, at most 25 % of its Gaussians"]["arm"].text == "none of this sweep"  # 25.1 %
-    half = chosen["streetgs, at most 50 % of its Gaussians"]
-    assert (half["arm"].text, half["PSNR full, dB"].text, half["share, %"].text) == ("streetgs+removal", "-0.30", "25")
-    assert half["train minutes"].text == "1.67"  # 100 seconds
 
 
 def test_a_larger_arm_within_the_budget_is_better():
