@@ -195,9 +195,13 @@ def by_unit(frame: pd.DataFrame, column: str) -> pd.Series:
     >>> by_unit(frame, "MB").to_dict(), len(by_unit(frame, "FPS"))
     ({('a', '', 0): 2.0}, 0)
     """
+    return _means(of_runs(frame, column), UNIT)
+
+
+def of_runs(frame: pd.DataFrame, column: str) -> pd.Series:
+    """Return scene, clip and seed -> the number of each run that has it; several runs may share a place."""
     known = frame.reindex(columns=[*UNIT, column]).dropna()
-    # The exact mean: a sum in floats would move numbers across the limits that tables are cut by.
-    return _means(pd.Series(known.set_index(UNIT)[column], dtype=float), UNIT)
+    return pd.Series(known.set_index(UNIT)[column], dtype=float)
 
 
 def by_scene(units: pd.Series) -> pd.Series:
@@ -212,4 +216,5 @@ def mean_over_scenes(units: pd.Series) -> float | None:
 
 
 def _means(values: pd.Series, levels: list[str]) -> pd.Series:
+    # The exact mean: a sum in floats would move numbers across the limits that tables are cut by.
     return values if values.empty else pd.Series(values.groupby(level=levels, sort=False).agg(statistics.fmean))

@@ -14,7 +14,7 @@ from sparsestreet.pictures.plots import plot_runs
 from sparsestreet.records.configuration import Setting, config_hash, differing_options, without
 from sparsestreet.records.run import CodeVersion, Machine
 from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
-from sparsestreet.report.collect import UNIT, RunRecord, by_scene, by_unit, check_definitions, summary_frame
+from sparsestreet.report.collect import UNIT, RunRecord, by_scene, by_unit, check_definitions, of_runs, summary_frame
 from sparsestreet.report.tables import ABSENT, BUSY, CAPPED, Spread, busy_note, markdown_lines, spread
 from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
 
@@ -440,7 +440,7 @@ def _variant_row(variant: Repeats, columns: Sequence[Quantity], over_scenes: boo
     """Return mean and spread over runs, or over the means of each scene's runs."""
     frame = summary_frame(variant.runs)
     n = frame.groupby(UNIT[:2]).ngroups if over_scenes else len(frame)
-    values = [frame.reindex(columns=[*UNIT, one.column]).dropna().set_index(UNIT)[one.column] for one in columns]
+    values = [of_runs(frame, one.column) for one in columns]
     cells = tuple(spread((by_scene(some) if over_scenes else some).tolist()) for some in values)
     runs = f"{n} scenes, n={len(frame)}" if over_scenes else _seeds(frame["seed"])
     return Row(variant.name, runs, n, cells, False, _capped(variant), _busy(frame, columns))
@@ -469,7 +469,7 @@ def _differences(ours: pd.DataFrame, theirs: pd.DataFrame, quantity: Quantity) -
 
 
 def _busy(frame: pd.DataFrame, columns: Sequence[Quantity]) -> tuple[bool, ...]:
-    return tuple(bool(one.clock) and not frame[one.clock].all() for one in columns)
+    return tuple(bool(one.clock) and not all(frame[one.clock]) for one in columns)
 
 
 def _seeds(seeds: Iterable[int]) -> str:

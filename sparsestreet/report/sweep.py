@@ -106,47 +106,49 @@ def _grids(
     return [grid for grid in grids if grid is not None and grid.rows]
 
 
-def _figures(found: Sequence[Variant], protocol: Protocol, folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
-    """Returns caption and SVG of each figure, and notes on figures that the records cannot give."""
-    drawn, absent = [], []
-
-    def take(written: bool, name: str, caption: str, lacking: str) -> None:
-        if written:
-            drawn.append((caption, (folder / f"{name}.svg").read_text(encoding="utf-8")))
-        else:
-            (folder / f"{name}.svg").unlink(missing_ok=True)
-            absent.append(lacking)
-
-    for cost in PARETO_COSTS:
-        name = f"pareto_{cost[0]}"
-        take(
-            pareto(found, protocol, cost, folder / f"{name}.svg"),
-            name,
-            f"Held-out PSNR against {cost[1]}: every run small, every arm's mean large, arrows from plain to pruned "
-            "over the scenes and seeds that both have, the front of the means dashed, controls grey. Hollow: the mean "
-            "of an arm that lacks runs, which is in no front."
-            + "".join(f" {note}." for note in (busy_variants(found) if cost[0] in ("frame", "training") else ())),
-            f"no figure of quality against {cost[1]}: no run has both",
-        )
-    take(
-        held_out_over_time(found, folder / "held_out.svg"),
-        "held_out",
+_QUALITY_CAPTION = (
+    "every run small, every arm's mean large, arrows from plain to pruned over the scenes and seeds that both have, "
+    "the front of the means dashed, controls grey. Hollow: the mean of an arm that lacks runs, which is in no front."
+)
+_OTHER_FIGURES = {
+    "held_out": (
+        held_out_over_time,
         "PSNR of a fixed probe of held-out views over the seconds of training, evaluation left out; a line a run.",
         "no curves of held-out PSNR over seconds: no run has curves/held_out.csv",
-    )
-    take(
-        counts_over_time(found, folder / "counts.svg"),
-        "counts",
+    ),
+    "counts": (
+        counts_over_time,
         "Gaussians over the steps, a line a run; dots where masks or passes of pruning took some.",
         "no counts over time: no run has records/counts.csv",
-    )
-    take(
-        frame_waterfall(found, folder / "waterfall.svg"),
-        "waterfall",
+    ),
+    "waterfall": (
+        frame_waterfall,
         "What a frame takes longer with each node class and effect, mean over an arm's runs; nodes that hide each "
         "other cost less together than the sum.",
         "no milliseconds by node and effect: no run has records/cost.json",
-    )
+    ),
+}
+"""Name of a file -> what draws it, its caption, and the note where no run has what it shows."""
+
+
+def _figures(found: Sequence[Variant], protocol: Protocol, folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """Return caption and SVG of each figure, and notes on figures that the records cannot give."""
+    known = {}
+    for cost in PARETO_COSTS:
+        busy = busy_variants(found) if cost[0] in ("frame", "training") else ()
+        known[f"pareto_{cost[0]}"] = (
+            lambda variants, path, cost=cost: pareto(variants, protocol, cost, path),
+            f"Held-out PSNR against {cost[1]}: {_QUALITY_CAPTION}" + "".join(f" {note}." for note in busy),
+            f"no figure of quality against {cost[1]}: no run has both",
+        )
+    drawn, absent = [], []
+    for name, (draw, caption, lacking) in (known | _OTHER_FIGURES).items():
+        path = folder / f"{name}.svg"
+        if draw(found, path):
+            drawn.append((caption, path.read_text(encoding="utf-8")))
+        else:
+            path.unlink(missing_ok=True)  # that of an earlier report
+            absent.append(lacking)
     return drawn, absent
 
 

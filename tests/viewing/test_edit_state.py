@@ -77,6 +77,8 @@ def test_what_the_file_said_stays():
     }
     assert "second" in edits.scene.nodes
     assert said["move"]["car"]["right"] == 1.0
+    edits.move("car", Offset())  # where it was recorded: there is no move whose time could be said
+    assert edits.said()["move"].keys() == {"tram"}
 
 
 def test_an_object_on_a_way_of_its_own_is_not_moved():
