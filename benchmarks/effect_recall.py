@@ -10,7 +10,7 @@ from sparsestreet.bench.records import RecordFile
 from sparsestreet.cli.commands.bench import record_file
 from sparsestreet.cli.commands.effects import planned
 from sparsestreet.cli.commands.options import run_command
-from sparsestreet.records.effects import EffectDecision
+from sparsestreet.records.run import EffectDecision
 
 LEVELS = (0.5, 2.0)
 """Times the dial at which an effect is meant to be called for: below the one it must be off, above the other on."""

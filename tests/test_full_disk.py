@@ -14,8 +14,7 @@ from safetensors.torch import save_file
 
 from sparsestreet.atomic import atomic_file, atomic_folder
 from sparsestreet.export.video import write_pictures
-from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.records.ledger import LEDGER, CountChange
+from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, CountChange, HeldOutLook
 from sparsestreet.training.callbacks import Checkpoints
 from tests.training.stubs import StubTrainer, background, make_system
 

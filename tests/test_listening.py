@@ -1,4 +1,4 @@
-"""Where a server listens; whom it answers is tried on the viewer itself (``tests/viewing/test_viewer.py``)."""
+"""Where a server listens; whom it answers is tried on the viewer itself (``tests/viewing/test_server.py``)."""
 
 import socket
 

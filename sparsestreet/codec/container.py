@@ -13,12 +13,44 @@ import zlib
 from collections.abc import Sequence
 from types import ModuleType, TracebackType
 
-from sparsestreet.codec.limits import Budget
+FREE = 2**28
+"""Bytes that any file may unpack to: 256 MiB."""
+PER_BYTE = 256
+"""Bytes more for each byte of the file. A street needs about 15; rows that are all the same need far more."""
+
+
+class Budget:
+    """Counts what a file unpacks to.
+
+    >>> Budget(10).take(100)
+    >>> Budget(10).take(10**15)
+    Traceback (most recent call last):
+    ...
+    ValueError: the file has 10 bytes and claims 1000000000000000 unpacked, above its limit of 268438016: it is damaged
+    """
+
+    def __init__(self, file_size: int) -> None:
+        self._file_size, self._taken = file_size, 0
+
+    @property
+    def limit(self) -> int:
+        """Bytes, all in all."""
+        return FREE + PER_BYTE * self._file_size
+
+    def take(self, count: int) -> None:
+        """Asks for so many bytes more, before they are allocated. Raises ValueError beyond the limit."""
+        self._taken += count
+        if count < 0 or self._taken > self.limit:
+            raise ValueError(
+                f"the file has {self._file_size} bytes and claims {self._taken} unpacked, above its limit of "
+                f"{self.limit}: it is damaged"
+            )
+
 
 MAGIC = b"\x89STREET\n"
 """The first byte is no text, the last one changes where a program takes the file for text."""
 VERSION = 1
-LARGEST = 2**26
+MAX_FRAME = 2**26
 """Bytes that a frame may unpack to."""
 LEVEL = 19
 """Of zstd: 3 % less than level 12."""
@@ -47,15 +79,15 @@ class FrameWriter:
     def write(self, tag: str, pieces: Sequence[bytes]) -> int:
         """Writes a frame and returns the bytes that it takes; statistics of a piece serve this piece alone.
 
-        Raises ValueError for more than ``LARGEST`` bytes.
+        Raises ValueError for more than ``MAX_FRAME`` bytes.
         """
         self._count += 1
         return self._write(tag.encode("ascii"), pieces)
 
     def _write(self, tag: bytes, pieces: Sequence[bytes]) -> int:
         unpacked = sum(map(len, pieces))
-        if unpacked > LARGEST:
-            raise ValueError(f"a frame holds at most {LARGEST} bytes, got {unpacked}: write several")
+        if unpacked > MAX_FRAME:
+            raise ValueError(f"a frame holds at most {MAX_FRAME} bytes, got {unpacked}: write several")
         stored = b"".join(self._compressor.compress(piece) for piece in pieces)
         sizes = _SIZES.pack(tag, len(stored), unpacked)
         self._file.write(sizes + struct.pack("<I", zlib.crc32(stored, zlib.crc32(sizes))) + stored)
@@ -73,7 +105,7 @@ class FrameReader:
         self._file, self._count = file, 0
         self.budget = Budget(file.seek(0, io.SEEK_END))
         file.seek(0)
-        self._decompressor = _zstandard().ZstdDecompressor(max_window_size=LARGEST)
+        self._decompressor = _zstandard().ZstdDecompressor(max_window_size=MAX_FRAME)
         if file.read(len(MAGIC)) != MAGIC:
             raise ValueError("it does not start as a .street does")
         (version,) = _VERSION.unpack(self._exactly(_VERSION.size))
@@ -96,8 +128,8 @@ class FrameReader:
         tag, stored, unpacked, checksum = _FRAME.unpack(head)
         if tag != wanted:
             raise ValueError(f"a part {wanted.decode()!r} should follow, got {tag!a}: it is damaged")
-        if unpacked > LARGEST or stored > LARGEST:
-            raise ValueError(f"a part claims {max(unpacked, stored)} bytes, at most {LARGEST} are allowed")
+        if unpacked > MAX_FRAME or stored > MAX_FRAME:
+            raise ValueError(f"a part claims {max(unpacked, stored)} bytes, at most {MAX_FRAME} are allowed")
         self.budget.take(unpacked)
         content = self._exactly(stored)
         if zlib.crc32(content, zlib.crc32(head[: _SIZES.size])) != checksum:

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int16, Int64, Shaped
 
-from sparsestreet.codec import harmonics, integers, positions, rotations
-from sparsestreet.codec.plain import packed_column, unpacked_column
-from sparsestreet.codec.reading import Cursor
+from sparsestreet.codec import arrays, vectors
+from sparsestreet.codec.arrays import Cursor, packed_column, unpacked_column
 
 LEVELS = 127
 """Of opacities between 0 and 1."""
@@ -84,7 +83,7 @@ class OtherColumn:
 
 def packed_block(block: Block, form: Form, steps: Steps) -> list[bytes]:
     """Returns the bytes of a block in pieces, a column each. Its means must fit a grid of this step (``fits``)."""
-    order, parts = positions.packed_points(block.means, steps.position)
+    order, parts = vectors.packed_points(block.means, steps.position)
     opacities = 1 / (1 + np.exp(-np.clip(block.opacity_logits[order], -80, 80)))
     levels = np.rint(LEVELS * opacities).astype(np.int64)
     # Rows of one grade together, so that zstd meets each step's statistics once.
@@ -93,10 +92,10 @@ def packed_block(block: Block, form: Form, steps: Steps) -> list[bytes]:
     pieces = [
         len(block).to_bytes(4, "little"),
         *parts,
-        *integers.packed(levels[:, None]),
+        *arrays.packed(levels[:, None]),
         *_packed_shapes(block.log_scales[order], block.quaternions[order], growth, form.named_axes, steps),
         np.float64(steps.color).tobytes(),
-        *integers.packed(_colors(block.harmonics[order], form.axes, steps.color * growth)),
+        *arrays.packed(_colors(block.harmonics[order], form.axes, steps.color * growth)),
     ]
     for name, column in form.others.items():
         pieces += packed_column(block.others[name][order], column.step)
@@ -113,15 +112,15 @@ def unpacked_block(content: bytes, form: Form) -> Block:
     cursor = Cursor(content)
     rows, size = int.from_bytes(cursor.take(4), "little"), len(form.axes)
     with np.errstate(all="ignore"):  # a damaged number overflows; the check below says so
-        means = positions.unpacked_points(cursor, rows)
-        levels = integers.unpacked(cursor, rows, 1)[:, 0]
+        means = vectors.unpacked_points(cursor, rows)
+        levels = arrays.unpacked(cursor, rows, 1)[:, 0]
         if rows and not 0 <= levels.min() <= levels.max() <= LEVELS:
             raise ValueError("an opacity lies outside 0 to 1: it is damaged")
         grouped = np.argsort(_grades(levels), kind="stable")
         growth = _growth(levels[grouped])
         log_scales, quaternions = _unpacked_shapes(cursor, growth, form.named_axes)
         (color,) = cursor.numbers("<d")
-        colors = harmonics.from_axes(integers.unpacked(cursor, rows, size) * (color * growth), form.axes)
+        colors = vectors.from_axes(arrays.unpacked(cursor, rows, size) * (color * growth), form.axes)
         others = {
             name: unpacked_column(cursor, rows, column.shape, column.dtype, column.step)
             for name, column in form.others.items()
@@ -152,7 +151,7 @@ def _logits(levels: Int64[np.ndarray, " n"]) -> Float64[np.ndarray, " n"]:
 def _colors(
     values: Float64[np.ndarray, "n d"], axes: Int16[np.ndarray, "d d"], step: Float64[np.ndarray, "n 1"]
 ) -> Int64[np.ndarray, "n d"]:
-    scaled = harmonics.along_axes(values, axes) / step
+    scaled = vectors.along_axes(values, axes) / step
     return (np.sign(scaled) * np.floor(np.abs(scaled) + 0.5 - _DEAD_ZONE)).astype(np.int64)
 
 
@@ -167,20 +166,20 @@ def _packed_shapes(
         lengths = np.linalg.norm(quaternions, axis=1, keepdims=True)
         turns = quaternions / np.where(lengths > 0, lengths, 1)
     else:
-        turns, orders = rotations.nearest_turn(quaternions)
+        turns, orders = vectors.nearest_turn(quaternions)
         log_scales = np.take_along_axis(log_scales, orders, axis=1)
     scales = np.rint(log_scales / (steps.log_scale * growth)).astype(np.int64)
     numbers = np.rint(turns / (steps.rotation * growth)).astype(np.int64)
-    return [np.array([steps.log_scale, steps.rotation]).tobytes(), *integers.packed(np.hstack([scales, numbers]))]
+    return [np.array([steps.log_scale, steps.rotation]).tobytes(), *arrays.packed(np.hstack([scales, numbers]))]
 
 
 def _unpacked_shapes(
     cursor: Cursor, growth: Float64[np.ndarray, "n 1"], named: bool
 ) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 4"]]:
     log_scale, rotation = cursor.numbers("<2d")
-    table = integers.unpacked(cursor, len(growth), 7 if named else 6)
+    table = arrays.unpacked(cursor, len(growth), 7 if named else 6)
     turns = table[:, 3:] * (rotation * growth)
     if not named:
-        return table[:, :3] * (log_scale * growth), rotations.quaternions_of(turns)
+        return table[:, :3] * (log_scale * growth), vectors.quaternions_of(turns)
     lengths = np.linalg.norm(turns, axis=1, keepdims=True)
     return table[:, :3] * (log_scale * growth), turns / np.where(lengths > 0, lengths, 1)

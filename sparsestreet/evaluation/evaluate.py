@@ -19,7 +19,7 @@ from sparsestreet.metrics.image import psnr_of_mse
 from sparsestreet.metrics.lpips import Lpips
 from sparsestreet.metrics.reported import ImageMetric, errors_by_region, reported_metrics
 from sparsestreet.ranks import ALONE, Ranks
-from sparsestreet.records.quality import FrameQuality, RegionQuality
+from sparsestreet.records.summary import FrameQuality, RegionQuality
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.types import Frame, View

@@ -26,9 +26,16 @@ from sparsestreet.metrics.reported import PerceptualDistance, Psnr, SetDistances
 from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import clock_of, stage
-from sparsestreet.records.novel import NOVEL, NovelRecord, NovelShift
-from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
-from sparsestreet.records.quality import FrameQuality, summarize
+from sparsestreet.records.summary import (
+    NOVEL,
+    PRESETS,
+    FrameQuality,
+    NovelRecord,
+    NovelShift,
+    PresetRecord,
+    RenderedAs,
+    summarize,
+)
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Frame, View

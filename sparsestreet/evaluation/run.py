@@ -20,13 +20,24 @@ from sparsestreet.pictures.images import KINDS, Picture, draw_lidar_end, error_p
 from sparsestreet.pictures.sheets import Legend, picture_sheet
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.costs import EffectGain, update_costs
-from sparsestreet.records.latency import LATENCY, Latency, clock_rows
-from sparsestreet.records.novel import NOVEL
-from sparsestreet.records.presets import PRESETS
-from sparsestreet.records.provenance import this_machine, this_source
-from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, FrameQuality, camera_means, summarize
-from sparsestreet.records.run import RunDescription
-from sparsestreet.records.summary import SUMMARY, Evaluation, GuardCounts, RunSummary
+from sparsestreet.records.run import RunDescription, this_machine, this_source
+from sparsestreet.records.summary import (
+    HELD_OUT,
+    LATENCY,
+    NOVEL,
+    PRESETS,
+    QUALITY,
+    SUMMARY,
+    TRAINING,
+    Evaluation,
+    FrameQuality,
+    GuardCounts,
+    Latency,
+    RunSummary,
+    camera_means,
+    clock_rows,
+    summarize,
+)
 from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions

@@ -21,9 +21,8 @@ from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import splat
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.records.costs import NodeCost
-from sparsestreet.records.latency import FRAME, RASTER, RIG, Latency, Percentiles
-from sparsestreet.records.provenance import processor_name
-from sparsestreet.records.run import Noise
+from sparsestreet.records.run import Noise, processor_name
+from sparsestreet.records.summary import FRAME, RASTER, RIG, Latency, Percentiles
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Node

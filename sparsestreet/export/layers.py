@@ -3,28 +3,103 @@
 import colorsys
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped, UInt8, UInt16
 from PIL import Image
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_folder
-from sparsestreet.export.lidar import FARTHEST, LidarReturns, enlarged
+from sparsestreet.data.lazy import Sweeps
+from sparsestreet.data.lidar import depth_image
 from sparsestreet.export.path import CameraPath
-from sparsestreet.export.seen import images_seen
 from sparsestreet.export.video import Picture, side_by_side
-from sparsestreet.ops import splat
+from sparsestreet.ops import contribution, splat
 from sparsestreet.pictures.images import color_map
 from sparsestreet.scene.centers import node_legend
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.scene.storage import StoredScene
-from sparsestreet.types import View
+from sparsestreet.types import Camera, View
+
+_COLUMN = "images_seen"
+
+
+@torch.no_grad()
+def count_images(stored: StoredScene, views: Iterable[View]) -> None:
+    """Gives the rows of all nodes a column: the number of views in which a Gaussian shows.
+
+    It shows where it has the largest part of at least one pixel, as in the paper's importance. What another Gaussian
+    hides has no such pixel. Objects that are edited, moved or copied later take their counts along.
+    """
+    counts = {
+        name: torch.zeros(len(node.rows), dtype=torch.int64, device=node.rows.means.device)
+        for name, node in stored.scene.nodes.items()
+    }
+    for view in views:
+        placed = stored.scene.gaussians_at(view)
+        options = stored.options
+        counted = contribution(placed.gaussians, placed.view.camera, settings=options.settings, backend=options.backend)
+        for name, rows in placed.spans.items():
+            counts[name] += counted.dominant[rows] > 0
+    for name, node in stored.scene.nodes.items():
+        node.rows.register_buffer(_COLUMN, counts[name], persistent=False)
+
+
+def images_seen(scene: SceneGraph, spans: Mapping[str, slice]) -> Float[Tensor, " n"]:
+    """Returns the counts in the order of a rendering's rows; 0 for what the recorded images never had.
+
+    Raises ValueError where no node has counts.
+    """
+    columns = {name: scene.nodes[name].rows.columns() for name in spans}
+    if not any(_COLUMN in found for found in columns.values()):
+        raise ValueError("nobody has counted the recorded images of this scene: call count_images before it is edited")
+    return torch.cat([found.get(_COLUMN, torch.zeros_like(found["means"][:, 0])).float() for found in columns.values()])
+
+
+MAX_MILLIMETERS = 65_535
+"""Millimeters of a depth that is no smaller; 0 where there is none."""
+
+
+class LidarReturns:
+    """The sweeps of a log, each at its time."""
+
+    def __init__(self, sweeps: Sweeps, times: Mapping[int, float]) -> None:
+        """``times``: frame of each sweep -> normalized time."""
+        self.times = times
+        self._load = sweeps.load_gray
+        self._read: tuple[int, Float[Tensor, "n 3"]] | None = None
+
+    def points(self, time: float) -> Float[Tensor, "n 3"]:
+        """Returns of the sweep that is nearest in time, in the world; cameras of an instant share one reading."""
+        frame = min(self.times, key=lambda frame: abs(self.times[frame] - time))
+        if self._read is None or self._read[0] != frame:
+            self._read = frame, self._load(frame).points
+        return self._read[1]
+
+    def millimeters(self, camera: Camera, time: float) -> UInt16[np.ndarray, "h w"]:
+        """Depth along the optical axis of the nearest return in each pixel; 0: none; see ``MAX_MILLIMETERS``.
+
+        The lens is followed, a rolling shutter is not: all returns are where the sweep has them.
+        """
+        depth = depth_image(self.points(time), camera)
+        millimeters = (1000 * depth).round().clamp(max=MAX_MILLIMETERS)
+        return millimeters.numpy().astype(np.uint16)
+
+
+def enlarged(values: UInt16[np.ndarray, "h w"], side: int) -> UInt16[np.ndarray, "h w"]:
+    """Each value as a square of so many pixels, to the right and down; the nearer one where two of them meet."""
+    found = np.where(values > 0, values.astype(np.int64), MAX_MILLIMETERS + 1)
+    padded = np.pad(found, ((side - 1, 0), (side - 1, 0)), constant_values=MAX_MILLIMETERS + 1)
+    height, width = found.shape
+    found = np.min([padded[y : y + height, x : x + width] for y in range(side) for x in range(side)], axis=0)
+    return np.where(found > MAX_MILLIMETERS, 0, found).astype(np.uint16)
+
 
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
 """Those that are of the scene; ``lidar`` is of the log, ``seen`` of its images."""
@@ -39,9 +114,9 @@ _DOTS = 320
 """Dots of the lidar that fit side by side into a picture, at most."""
 _NEAR, _FAR = 1.0, 100.0
 """Meters of the lightest and of the darkest color in a picture of depth."""
-_MANY = 32
+_ENOUGH_IMAGES = 32
 """Images that have seen enough: the lightest color in a picture of ``seen``."""
-_MOST = 255
+_MAX_IMAGES = 255
 _FIRST_HARMONIC = 0.28209479177387814
 
 
@@ -86,7 +161,7 @@ def layer_values(
         elif layer == "alpha":
             found[layer] = (rendering.alpha.clamp(0, 1) * 255).round().byte().cpu().numpy()
         elif layer == "depth":
-            millimeters = (1000 * rendering.depth).round().clamp(1, FARTHEST)
+            millimeters = (1000 * rendering.depth).round().clamp(1, MAX_MILLIMETERS)
             shown = torch.where(rendering.alpha >= _SOLID, millimeters, 0.0)
             found[layer] = shown.cpu().numpy().astype(np.uint16)
         elif layer == "lidar":
@@ -116,7 +191,7 @@ def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Pictu
     if layer == "depth":
         return np.where(values[..., None] > 0, _by_distance(values), 0).astype(np.uint8)
     if layer == "seen":
-        return color_map(np.log2(1.0 + values) / np.log2(1.0 + _MANY))
+        return color_map(np.log2(1.0 + values) / np.log2(1.0 + _ENOUGH_IMAGES))
     if layer == "lidar":
         dots = enlarged(values, math.ceil(values.shape[1] / _DOTS))
         return np.where(dots[..., None] > 0, _by_distance(dots), 0 if under is None else under // 2).astype(np.uint8)
@@ -189,10 +264,10 @@ def tables(stored: StoredScene, layers: Sequence[str]) -> Mapping[str, Any]:
 
 def _seen(stored: StoredScene, view: View, rendering: SceneRendering) -> UInt8[np.ndarray, "h w"]:
     """Images that showed what the pixel shows, rounded; 0 also where the pixel has no depth."""
-    share = images_seen(stored.scene, rendering.spans).clamp(max=_MOST) / _MOST
+    share = images_seen(stored.scene, rendering.spans).clamp(max=_MAX_IMAGES) / _MAX_IMAGES
     summed = _splatted(stored, stored.scene.seen(view), rendering, share[:, None].expand(-1, 3))[..., 0]
-    mean = _MOST * summed / rendering.alpha.clamp(min=_SOLID)
-    return torch.where(rendering.alpha >= _SOLID, mean.round().clamp(0, _MOST), 0.0).byte().cpu().numpy()
+    mean = _MAX_IMAGES * summed / rendering.alpha.clamp(min=_SOLID)
+    return torch.where(rendering.alpha >= _SOLID, mean.round().clamp(0, _MAX_IMAGES), 0.0).byte().cpu().numpy()
 
 
 def _node_ids(rendering: SceneRendering) -> Int[Tensor, " n"]:

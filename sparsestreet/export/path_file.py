@@ -14,8 +14,7 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from sparsestreet.export.path import CameraPath
-from sparsestreet.export.rig import intrinsics
+from sparsestreet.export.path import CameraPath, intrinsics
 from sparsestreet.geometry.cameras import inverse, rigidity_error
 from sparsestreet.types import Camera, View
 

@@ -23,7 +23,7 @@ _ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)
 
 _FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 
-_LARGEST_OPACITY = 1 - 2.0**-25
+_MAX_OPACITY = 1 - 2.0**-25
 """Halfway between 1 and the largest float32 below 1. Its logit is finite, and the sigmoid of this logit is 1 again."""
 
 _TOLD_APART = 1000
@@ -32,7 +32,7 @@ _TOLD_APART = 1000
 ANTIALIASED = "comment SplatRenderMode: mip"
 """In the header: what gsplat and Brush go by. Others add the blur of plain 3DGS."""
 
-_SMALLEST_SCALE = 1e-30
+_MIN_SCALE = 1e-30
 """Smallest scale that is written, meters; a scale of 0 has no logarithm."""
 
 
@@ -156,7 +156,7 @@ def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
     """Returns one row a vertex, its properties in the order of the header, little endian."""
     keep = gaussians.opacities > 0
     values = {name: getattr(gaussians, name).detach()[keep].cpu() for name in _FIELDS}
-    opacities = values["opacities"].double().clamp(max=_LARGEST_OPACITY)
+    opacities = values["opacities"].double().clamp(max=_MAX_OPACITY)
     columns = (
         values["means"],
         torch.zeros_like(values["means"]),
@@ -164,7 +164,7 @@ def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
         # [term, color] becomes [color, term], because all terms of red come first.
         values["sh"][:, 1:].mT.flatten(1),
         torch.logit(opacities)[:, None],
-        values["scales"].double().clamp(min=_SMALLEST_SCALE).log(),
+        values["scales"].double().clamp(min=_MIN_SCALE).log(),
         normalized(values["quaternions"].double()),
     )
     return torch.cat([column.float() for column in columns], dim=1).numpy().astype("<f4")

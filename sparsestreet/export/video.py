@@ -28,9 +28,9 @@ _COLORS = "color_primaries=bt709:color_trc=bt709:colorspace=bt709"
 _FILTERS = ["-vf", f"scale=out_color_matrix=bt709,format=yuv420p,setparams={_COLORS}"]
 """States the color space in the file, because players guess differently without it."""
 _STREAMABLE = ["-movflags", "+faststart"]
-_LONGEST_SIDE = 16384
+_MAX_SIDE = 16384
 """Pixels, of libx264."""
-_LARGEST_CRF = 51
+_MAX_CRF = 51
 _SIGNALS = {-signal.SIGXFSZ: errno.EFBIG} if hasattr(signal, "SIGXFSZ") else {}
 _FULL = "no space left on device"
 
@@ -76,9 +76,9 @@ def picture_size(path: CameraPath, rows: int = 1) -> tuple[int, int]:
 
 def check_size(width: int, height: int) -> None:
     """Raise ValueError for pictures, of so many pixels, that no .mp4 holds."""
-    if max(width, height) > _LONGEST_SIDE:
+    if max(width, height) > _MAX_SIDE:
         raise ValueError(
-            f"a .mp4 has at most {_LONGEST_SIDE:,} pixels a side, got {width:,} x {height:,}: take a smaller width=, "
+            f"a .mp4 has at most {_MAX_SIDE:,} pixels a side, got {width:,} x {height:,}: take a smaller width=, "
             "fewer cameras= or layers=, or give out=FOLDER for PNGs"
         )
 
@@ -114,7 +114,7 @@ def _write_video(path: Path, pictures: Iterable[Picture], fps: float, quality: f
     rate = str(Fraction(fps).limit_denominator())
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate, "-i", "-", "-an"]
     # crf 0 is another profile, lossless, which hardly anything plays.
-    crf = str(max(int((1 - quality / 10) * _LARGEST_CRF), 1))
+    crf = str(max(int((1 - quality / 10) * _MAX_CRF), 1))
     coded = ["-vcodec", "libx264", "-pix_fmt", "yuv420p", "-crf", crf, "-profile:v", "high", *_FILTERS, *_STREAMABLE]
 
     def checked() -> Iterator[Picture]:

@@ -3,6 +3,7 @@
 All images are uint8 [h, w, 3]. Errors share one fixed scale, so pictures of different runs can be compared.
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -132,3 +133,41 @@ def read_pictures(folder: Path) -> list[Picture]:
 def _read_png(path: Path) -> UInt8[np.ndarray, "h w 3"]:
     with Image.open(path) as image:
         return np.asarray(image.convert("RGB"))
+
+
+@dataclass(frozen=True)
+class Dots:
+    """Groups of points in a plane."""
+
+    title: str
+    x: str
+    y: str
+    groups: Mapping[str, tuple[Sequence[float], Sequence[float]]]
+    """Name -> both coordinates of its points."""
+    joined: bool = False
+    """Whether the points of a group are a curve."""
+    diagonal: bool = False
+    """Whether the line on which both coordinates are equal is drawn."""
+
+
+@dataclass(frozen=True)
+class Marked:
+    """An image of the log, of which some pixels are marked."""
+
+    title: str
+    image: UInt8[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Values at places of an image."""
+
+    title: str
+    image: UInt8[np.ndarray, "h w 3"]
+    pixels: Float[np.ndarray, "n 2"]
+    values: Float[np.ndarray, " n"]
+    unit: str
+
+
+Panel = Dots | Marked | Places

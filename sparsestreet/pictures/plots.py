@@ -1,19 +1,26 @@
 """Draws curves over training and the scatter of runs (matplotlib without a display)."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from sparsestreet.atomic import atomic_file
+from sparsestreet.pictures.images import Dots, Marked, Panel, Places
+from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, LOGGED, MASK, PRUNING, CountChange
+from sparsestreet.records.run import RUN
+
 # Okabe and Ito's palette: distinguishable with any color vision.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 _MARKERS = "osD^vP*"  # one fewer than colors, so that pairs of both repeat late
 _DASHES = ("--", ":", "-.")
-_FEW_DECADES = 300
+_MAX_FULL_TICKS = 300
 """Ratio of the ends of an axis below which 2 and 5 times a power of ten have labels."""
 
 
@@ -48,7 +55,7 @@ def plot_counts(
     axes.yaxis.set_major_formatter(labels)
     low, high = axes.get_ylim()
     # Within a decade or two the powers of ten are too few to read a count by.
-    axes.yaxis.set_minor_formatter(labels if high < _FEW_DECADES * low else NullFormatter())
+    axes.yaxis.set_minor_formatter(labels if high < _MAX_FULL_TICKS * low else NullFormatter())
     axes.yaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     _finish(figure, axes, path)
 
@@ -133,3 +140,136 @@ def _finish(figure: Figure, axes: Axes, path: Path) -> None:
         axes.legend(frameon=False, fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
+
+
+MARKED = (MASK, PRUNING)
+"""Reasons of the changes that the curves mark."""
+
+PSNR_COLUMNS = {"training, running mean": "psnr", "held out": "val/psnr"}
+"""Curve -> its column in ``curves/metrics.csv``."""
+
+
+_NOT_HELD_OUT = "PSNR over training (no look at held-out views: trainer.val_check_interval, split.stride)"
+
+HELD_OUT_COLUMNS = {"full image": "psnr_full", "humans": "psnr_human", "vehicles": "psnr_vehicle"}
+"""Curve -> its column in ``curves/held_out.csv``."""
+
+
+def draw_history(run: Path) -> None:
+    """Writes ``counts.png``, ``psnr.png`` and ``held_out.png`` to the run's folder ``curves``.
+
+    They show ``records/counts.csv``, ``curves/metrics.csv`` and ``curves/held_out.csv``. A run without one of these
+    files gets no picture of it. Raises RecordError for a malformed file.
+    """
+    changes = LEDGER.find(run)
+    events = marks(changes or ())
+    if changes is not None:
+        steps, counts = _to_the_end(*count_curves(changes), run)
+        plot_counts(run / "curves" / "counts.png", steps, counts, events)
+    curves = psnr_curves(LOGGED.rows(run), PSNR_COLUMNS, "step")
+    if curves:
+        title = "PSNR over training" if "held out" in curves else _NOT_HELD_OUT
+        plot_psnr(run / "curves" / "psnr.png", curves, events, title)
+    curves = psnr_curves([asdict(look) for look in HELD_OUT_CURVE.find(run) or ()], HELD_OUT_COLUMNS, "seconds")
+    if curves:
+        title = "Held-out PSNR over training time, without evaluation"
+        plot_psnr(run / "curves" / "held_out.png", curves, (), title, "seconds")
+
+
+def _to_the_end(steps: list[int], counts: dict[str, list[int]], run: Path) -> tuple[list[int], dict[str, list[int]]]:
+    """Returns the curves with the run's last step, at which nothing need have changed."""
+    known = RUN.find(run)
+    if known is None or not steps or known.steps <= steps[-1]:
+        return steps, counts
+    return [*steps, known.steps], {name: [*series, series[-1]] for name, series in counts.items()}
+
+
+def count_curves(changes: Sequence[CountChange]) -> tuple[list[int], dict[str, list[int]]]:
+    """Returns the steps at which any node changes, and node -> its number of Gaussians after each of these steps.
+
+    >>> count_curves([CountChange(0, "road", 0, 9, "start"), CountChange(5, "cars", 0, 4, "start")])
+    ([0, 5], {'road': [9, 9], 'cars': [0, 4]})
+    """
+    steps = sorted({change.step for change in changes})
+    curves: dict[str, list[int]] = {change.node: [] for change in changes}
+    for node, series in curves.items():
+        # The ledger is in order, so the last of several changes in one step counts.
+        after = {change.step: change.after for change in changes if change.node == node}
+        gaussians = 0
+        for step in steps:
+            gaussians = after.get(step, gaussians)
+            series.append(gaussians)
+    return steps, curves
+
+
+def marks(changes: Sequence[CountChange]) -> list[tuple[int, str]]:
+    """Returns (step, reason) of the changes that make the scene small, each once, in order.
+
+    >>> marks([CountChange(0, "road", 0, 9, "start"), CountChange(8, "road", 9, 6, PRUNING)])
+    [(8, 'pruning')]
+    """
+    return list(dict.fromkeys((change.step, change.reason) for change in changes if change.reason in MARKED))
+
+
+def psnr_curves(
+    rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str], along: str
+) -> dict[str, tuple[Sequence[int | float], Sequence[float]]]:
+    """Returns name of a curve -> (steps or seconds, dB), from the rows that have a value.
+
+    >>> psnr_curves([{"step": 1.0, "psnr": 20.5}, {"step": 2.0, "psnr": None}], {"training": "psnr"}, "step")
+    {'training': ((1.0,), (20.5,))}
+    """
+    curves = {}
+    for label, column in columns.items():
+        points = [(float(row[along]), float(row[column])) for row in rows if row.get(column) not in (None, "")]
+        if points:
+            curves[label] = tuple(zip(*points, strict=True))
+    return curves
+
+
+COLUMNS = 2
+_MARK = np.array([230.0, 40.0, 40.0])
+
+
+def draw_evidence(path: Path, title: str, panels: Sequence[Panel]) -> None:
+    """Writes a PNG with a cell for each panel. Raises ValueError without any."""
+    if not panels:
+        raise ValueError("a picture of evidence needs a panel, and no effect has one")
+    lines = -(-len(panels) // COLUMNS)
+    figure = Figure(figsize=(12.0, 0.5 + 3.3 * lines), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    cells = figure.subplots(lines, COLUMNS, squeeze=False).flat
+    for axes, panel in zip(cells, panels, strict=False):
+        axes.set_title(panel.title, fontsize=9)
+        _draw(axes, panel)
+    for axes in list(figure.axes)[len(panels) : lines * COLUMNS]:
+        axes.set_axis_off()
+    figure.suptitle(title, fontsize=11)
+    with atomic_file(path) as file:
+        figure.savefig(file, format="png")
+
+
+def _draw(axes: Axes, panel: Panel) -> None:
+    match panel:
+        case Dots():
+            _dots(axes, panel)
+        case Marked(_, image, mask):
+            axes.imshow(np.where(mask[..., None], 0.4 * image + 0.6 * _MARK, image).astype(np.uint8))
+            axes.set_axis_off()
+        case Places(_, image, pixels, values, unit):
+            axes.imshow(image, alpha=0.5)
+            drawn = axes.scatter(pixels[:, 0], pixels[:, 1], c=values, s=6, cmap="viridis", vmin=0.0)
+            axes.figure.colorbar(drawn, ax=axes, label=unit, shrink=0.8)
+            axes.set_axis_off()
+
+
+def _dots(axes: Axes, panel: Dots) -> None:
+    for name, (x, y) in panel.groups.items():
+        axes.plot(x, y, ".-" if panel.joined else ".", markersize=4, linewidth=0.8, label=name)
+    if panel.diagonal:
+        axes.axline((0.0, 0.0), slope=1.0, color="0.6", linewidth=0.8, zorder=0)
+    axes.axhline(0.0, color="0.8", linewidth=0.8, zorder=0)
+    axes.set_xlabel(panel.x, fontsize=8)
+    axes.set_ylabel(panel.y, fontsize=8)
+    axes.tick_params(labelsize=7)
+    axes.legend(fontsize=7)

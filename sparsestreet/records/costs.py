@@ -5,14 +5,37 @@ Training and evaluation each write their own part and keep the other's.
 
 import statistics
 from collections import defaultdict
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
-from sparsestreet.records.file import JsonFile
+from sparsestreet.records.file import CsvFile, JsonFile
 from sparsestreet.records.run import Noise
-from sparsestreet.records.step_phases import STEP_PHASES
 from sparsestreet.records.strict_json import version
+
+
+@dataclass(frozen=True)
+class StepPhase:
+    """A part of a step that was timed."""
+
+    step: int
+    phase: str
+    milliseconds: float
+
+
+def _cells(part: StepPhase) -> Sequence[object]:
+    return part.step, part.phase, f"{part.milliseconds:.4f}"
+
+
+def _part_step_phases(cells: Sequence[str]) -> StepPhase:
+    step, phase, milliseconds = cells
+    return StepPhase(int(step), phase, float(milliseconds))
+
+
+STEP_PHASES = CsvFile(
+    "records/phases.csv", tuple(field.name for field in fields(StepPhase)), _cells, _part_step_phases, "train the run"
+)
+
 
 FORMAT = 1
 """Version of ``cost.json``; raised when a key changes its meaning."""

@@ -74,7 +74,7 @@ class JsonFile(RunFile, Generic[Record]):
     """A frozen dataclass as JSON; see ``strict_json``.
 
     >>> import tempfile
-    >>> from sparsestreet.records.failures import FAILURE, FailedRun
+    >>> from sparsestreet.records.run import FAILURE, FailedRun
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     FAILURE.write(Path(folder), FailedRun(label="3dgs", seed=0, command="train", error="no log", trace=""))
     ...     FAILURE.read(Path(folder)).error
@@ -101,7 +101,7 @@ class CsvFile(RunFile, Generic[Row]):
     """Comma-separated rows under a header that is checked.
 
     >>> import tempfile
-    >>> from sparsestreet.records.ledger import LEDGER, CountChange
+    >>> from sparsestreet.records.curves import LEDGER, CountChange
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     LEDGER.write(Path(folder), [CountChange(100, "background", 5000, 4000, "cull")])
     ...     LEDGER.read(Path(folder))[0].after

@@ -1,11 +1,43 @@
-"""``RUN/run.json``: what identifies a run and what made it; training writes it once."""
+"""The files beside a run's configuration: ``run.json`` says what made it, others why it failed or whence it came."""
 
+import os
+import platform
+import subprocess
 from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
 
 from sparsestreet.records.configuration import Setting
-from sparsestreet.records.effects import EffectDecision
 from sparsestreet.records.file import JsonFile
 from sparsestreet.records.strict_json import EXACT, version
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectDecision:
+    """One effect that was asked for its reasons before training."""
+
+    name: str
+    on: bool
+    source: str
+    """Who decided: "declared" by the log's files, "measured" on its images, points or boxes, "forced" by the
+    configuration."""
+    reason: str
+    """One sentence, without a full stop."""
+    value: float | None
+    """What was declared, measured or counted; None: nothing."""
+    unit: str
+    """Of value, threshold and noise."""
+    threshold: float | None
+    """Value from which the effect is called for."""
+    noise: float | None
+    """Standard error of the value; None: unknown."""
+    numbers: int
+    """Predicted count of stored float32 numbers, if it is on."""
+    ms: float
+    """Predicted milliseconds of a frame, if it is on."""
+    gain: float | None
+    """Predicted gain in PSNR, dB; None: no prediction."""
+
 
 RUN_FORMAT = 2
 """Version of ``run.json``; raised when a key changes its meaning."""
@@ -96,3 +128,108 @@ class RunDescription:
 
 
 RUN = JsonFile("run.json", RunDescription)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FailedRun:
+    """A job that ended with an error."""
+
+    format: int = version(1, "run the sweep again")
+    label: str
+    """The column that the run would have had in a table, such as "streetgs+paper"."""
+    seed: int
+    command: str
+    """The command of this job alone."""
+    error: str
+    """The error, in a sentence."""
+    trace: str
+    """Python's traceback."""
+
+
+FAILURE = JsonFile("failed.json", FailedRun)
+
+
+def read_failures(sweep: Path) -> list[tuple[Path, FailedRun]]:
+    """Returns folder and failure of every failed job below a folder, sorted. Raises RecordError for a malformed one."""
+    return [(run, FAILURE.read(run)) for run in FAILURE.runs(sweep)]
+
+
+RIG_FORMAT = 1
+"""Version of ``rig.json``; raised when a key changes its meaning."""
+
+Matrix = tuple[tuple[float, ...], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigRecord:
+    """The content of ``rig.json``; runs of earlier versions have none."""
+
+    format: int = version(RIG_FORMAT, "train the run again, or delete the file")
+    camera_names: tuple[str, ...]
+    """As the data set calls them, by camera index; empty: they have none but their indices."""
+    dataset_from_world: Matrix = field(metadata=EXACT)
+    """4x4: adds back what re-centering took away from the data set's own world."""
+    world_from_vehicle: tuple[Matrix, ...] | None = field(metadata=EXACT)
+    """4x4, x ahead, y left, z up, in the re-centered world; None: the log says nothing of the car."""
+    vehicle_stamps: tuple[int, ...] | None
+    """Nanoseconds on the log's clock, one a pose; None: the poses are those of the frames."""
+
+    def __post_init__(self) -> None:
+        for matrix in (self.dataset_from_world, *(self.world_from_vehicle or ())):
+            if len(matrix) != 4 or any(len(row) != 4 for row in matrix):
+                raise ValueError(f"a pose is 4 x 4 numbers, got {matrix}")
+        poses, stamps = self.world_from_vehicle, self.vehicle_stamps
+        if stamps is not None and len(stamps) != len(poses or ()):
+            raise ValueError(f"each pose has a stamp, got {len(poses or ())} poses and {len(stamps)} stamps")
+        if poses is not None and not poses:
+            raise ValueError("a vehicle has a pose, got none")
+
+
+RIG = JsonFile("rig.json", RigRecord)
+
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+
+
+def this_machine() -> Machine:
+    """Returns processor, cores and software versions; no host or user name."""
+    return Machine(
+        processor=processor_name(),
+        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        system=f"{platform.system()} {platform.machine()}",
+        python=platform.python_version(),
+        torch=metadata.version("torch"),
+    )
+
+
+def processor_name() -> str:
+    """Returns the processor's model, or its architecture if the system does not name a model."""
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        for line in cpuinfo.read_text().splitlines():
+            key, _, value = line.partition(":")
+            if key.strip() == "model name":
+                return value.strip()
+    return platform.processor() or platform.machine()
+
+
+def this_source(package: Path = _PACKAGE) -> CodeVersion:
+    """Returns the commit of the checkout that holds the package, and whether tracked files differ from it.
+
+    Both are None if git is not installed or no checkout tracks the package. An installed copy inside another
+    repository must not carry that repository's commit.
+    """
+    tracked = _git(package, "ls-files", "--error-unmatch", "__init__.py")
+    commit = _git(package, "rev-parse", "HEAD")
+    if tracked is None or commit is None:
+        return CodeVersion(None, None)
+    return CodeVersion(commit, _git(package, "status", "--porcelain", "--untracked-files=no") != "")
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    """Returns the output of a git command, or None if git is missing or fails."""
+    try:
+        answer = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
+    except (FileNotFoundError, subprocess.CalledProcessError):
+        return None
+    return answer.stdout.strip()

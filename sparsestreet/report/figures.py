@@ -1,8 +1,9 @@
-"""Figures of a sweep: their style, and quality against each cost (matplotlib without a display)."""
+"""Figures of a sweep (matplotlib without a display): quality against costs, curves over time, a frame's parts."""
 
 import io
 import re
 import statistics
+import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,28 +12,34 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import matplotlib
+import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from sparsestreet.metrics.definitions import Protocol
-from sparsestreet.records.quality import HELD_OUT
-from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Unit, Value, by_scene, plain_of
+from sparsestreet.pictures.plots import count_curves, marks
+from sparsestreet.records.costs import COSTS
+from sparsestreet.records.curves import LEDGER
+from sparsestreet.records.summary import HELD_OUT
+from sparsestreet.report.collect import by_scene
+from sparsestreet.report.costs import curves_of, curves_of_runs, mean_curve
+from sparsestreet.report.variants import Variant, plain_of
 
 T = TypeVar("T")
 
 # Okabe and Ito's palette with a slightly lighter blue: distinguishable with any color vision, on white and on black.
-# The last four are for the seventh arm and on.
+# The last four are for the seventh variant and on.
 COLORS = ("#1f86c9", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7a5195", "#8c564b", "#5c6f1c", "#b3003c")
 GREY = "#8c8c8c"
 _MARKERS = {"none": "o", "paper": "s", "paper_short": "s", "removal": "D", "masks": "^", "importance": "v"}
 _MARKERS |= {"random": "x", "opacity": "+"}
 _SPARE = "P^vX*<>phd8H"
-"""Markers of other arms, in turn."""
+"""Markers of other variants, in turn."""
 _DASHES = ("-", "--", ":", "-.")
 _INK = "#010203"
 """Stands for the color of the page's text."""
@@ -52,13 +59,13 @@ _STYLE: dict[Any, Any] = {
 LEGEND = {"frameon": False, "labelcolor": _INK, "fontsize": 8}
 """Style of every legend."""
 
-PARETO_COSTS: tuple[tuple[str, str, Callable[[RunSummary], float | None]], ...] = (
-    ("gaussians", "Gaussians", lambda run: float(run.gaussians_total)),
-    ("megabytes", "MB", lambda run: run.bytes_total / 1e6),
-    ("frame", "milliseconds a frame", lambda run: run.latency.p50),
-    ("training", "training minutes", lambda run: run.run.training_seconds and run.run.training_seconds / 60),
+PARETO_COSTS = (
+    ("gaussians", "Gaussians", "Gaussians"),
+    ("megabytes", "MB", "MB"),
+    ("frame", "milliseconds a frame", "ms/frame"),
+    ("training", "training minutes", "train minutes"),
 )
-"""Name, axis label and value of each cost that quality is drawn against."""
+"""Name, axis label and column of each cost that quality is drawn against."""
 
 
 def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, list[Axes]]:
@@ -113,47 +120,47 @@ def _titled(svg: str, name: str, texts: Sequence[str]) -> str:
 
 @dataclass(frozen=True)
 class Style:
-    """How an arm is drawn. Two arms of a figure differ in it."""
+    """How a variant is drawn. Two variants of a figure differ in it."""
 
     kind: str
-    """What the arm is beside its method: its sparsification, or all that its name says where that is of several."""
+    """What the variant is beside its method: its sparsification, or all that its name says where that is of several."""
     method: str
-    """Color of the arm's method; grey for a control."""
+    """Color of the variant's method; grey for a control."""
     color: str
     """Color of its kind, for figures or panels of one method; grey for a control."""
     marker: str
     dashes: str
 
 
-def styles(arms: Sequence[Arm]) -> dict[str, Style]:
-    """Returns name of an arm -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
-    methods, kinds = list(dict.fromkeys(arm.plain_label for arm in arms)), _kinds(arms)
+def styles(variants: Sequence[Variant]) -> dict[str, Style]:
+    """Returns name of a variant -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
+    methods, kinds = list(dict.fromkeys(variant.plain_label for variant in variants)), _kinds(variants)
     every = list(dict.fromkeys(kinds.values()))
     known = {"none": 0, "paper": 1, "paper_short": 1, "removal": 2, "masks": 3, "importance": 4}
     colored = _in_turn(every, known, range(len(COLORS)))
     marked = _in_turn(every, _MARKERS, _SPARE)
     found = {}
-    for arm in arms:
-        kind = kinds[arm.name]
+    for variant in variants:
+        kind = kinds[variant.name]
         own = {"capped": ":", "random": "--", "opacity": "-."}.get(kind)
         dashes = own or _DASHES[every.index(kind) // len(COLORS) % len(_DASHES)]
-        if arm.control and not own:
+        if variant.control and not own:
             dashes = _DASHES[every.index(kind) % len(_DASHES)]
-        method = COLORS[methods.index(arm.plain_label) % len(COLORS)]
-        paints = (GREY, GREY) if arm.control else (method, COLORS[colored[kind]])
-        found[arm.name] = Style(_in_legend(arm, kind), *paints, marked[kind], dashes)
+        method = COLORS[methods.index(variant.plain_label) % len(COLORS)]
+        paints = (GREY, GREY) if variant.control else (method, COLORS[colored[kind]])
+        found[variant.name] = Style(_in_legend(variant, kind), *paints, marked[kind], dashes)
     return found
 
 
-def _kinds(arms: Sequence[Arm]) -> dict[str, str]:
-    """Returns name of an arm -> its sparsification, or all that its name says beside its method."""
-    of_method = Counter((arm.plain_label, arm.sparsify) for arm in arms)
+def _kinds(variants: Sequence[Variant]) -> dict[str, str]:
+    """Returns name of a variant -> its sparsification, or all that its name says beside its method."""
+    of_method = Counter((variant.plain_label, variant.sparsify) for variant in variants)
     several = {sparsify for (_, sparsify), number in of_method.items() if number > 1}
     return {
-        arm.name: (arm.name.removeprefix(arm.plain_label).strip(" +") or arm.sparsify)
-        if arm.sparsify in several
-        else arm.sparsify
-        for arm in arms
+        variant.name: (variant.name.removeprefix(variant.plain_label).strip(" +") or variant.sparsify)
+        if variant.sparsify in several
+        else variant.sparsify
+        for variant in variants
     }
 
 
@@ -168,10 +175,10 @@ def _in_turn(kinds: Sequence[str], known: Mapping[str, T], spare: Sequence[T]) -
     return found | {kind: left[index % len(left)] for index, kind in enumerate(others)}
 
 
-def _in_legend(arm: Arm, kind: str) -> str:
-    if arm.control:
+def _in_legend(variant: Variant, kind: str) -> str:
+    if variant.control:
         return f"control: {kind}"
-    return "plain" if kind == "none" else f"plain {kind}" if arm.sparsify == "none" else kind
+    return "plain" if kind == "none" else f"plain {kind}" if variant.sparsify == "none" else kind
 
 
 def short(value: float) -> str:
@@ -197,60 +204,68 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     return best
 
 
-def pareto(arms: Sequence[Arm], protocol: Protocol, cost: tuple[str, str, Value], path: Path) -> bool:
+def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str, str], path: Path) -> bool:
     """Draws quality of the full image, people and vehicles against one cost. Returns whether there was any to draw.
 
-    Every run is a small mark, every arm's mean a large one, with an arrow from plain to pruned. The front is that of
-    the means; controls are gray and in no front.
+    Every run is a small mark, every variant's mean a large one, with an arrow from plain to pruned. The front is that
+    of the means; controls are gray and in no front.
     """
     wanted = {"full image": protocol.psnr, "people": protocol.human[0], "vehicles": protocol.vehicle[0]}
     regions = {name: _held_out(metric) for name, metric in wanted.items()}
-    regions = {name: value for name, value in regions.items() if any(arm.mean(value) is not None for arm in arms)}
-    if not regions or all(arm.mean(cost[2]) is None for arm in arms):
+    regions = {
+        name: value for name, value in regions.items() if any(variant.mean(value) is not None for variant in variants)
+    }
+    if not regions or all(variant.mean(cost[2]) is None for variant in variants):
         return False
     figure, axes = panels(len(regions))
     says: Says = {}
     for index, (one, (name, value)) in enumerate(zip(axes, regions.items(), strict=True)):
-        says |= _pareto_panel(one, arms, cost, value, name)
+        says |= _pareto_panel(one, variants, cost, value, name)
         one.set_title(name, fontsize=10)
         one.set_xlabel(cost[1])
         if index == 0:
             one.set_ylabel("held-out PSNR, dB")
-    legend_below(figure, _legend(arms))
+    legend_below(figure, _legend(variants))
     write_svg(figure, path, says)
     return True
 
 
-def _held_out(metric: str) -> Value:
-    return lambda run: run.mean(metric, HELD_OUT)
+def _held_out(metric: str) -> str:
+    return f"{HELD_OUT} {metric}"
 
 
-def _pareto_panel(axes: Axes, arms: Sequence[Arm], of: tuple[str, str, Value], quality: Value, region: str) -> Says:
-    style = styles(arms)
+def _pareto_panel(axes: Axes, variants: Sequence[Variant], of: tuple[str, str, str], quality: str, region: str) -> Says:
+    style = styles(variants)
     cost, unit = of[2], of[1]
     means: dict[str, tuple[float, float]] = {}
     says: Says = {}
-    for number, arm in enumerate(arms):
-        paint, marker = _paint(style, arm), style[arm.name].marker
-        points = _points(arm, cost, quality)
-        if not points:
+    for number, variant in enumerate(variants):
+        paint, marker = _paint(style, variant), style[variant.name].marker
+        points = _points(variant, cost, quality)
+        if points.empty:
             continue
-        axes.scatter(*zip(*points.values(), strict=True), s=9, alpha=0.45, color=paint, marker=marker,
+        axes.scatter(points["cost"], points["quality"], s=9, alpha=0.45, color=paint, marker=marker,
                      linewidths=0.8, gid=(runs := f"{region} {number} runs"))  # fmt: skip
-        means[arm.name] = _mean_point(points)
-        says[runs] = [f"{arm.name}, {scene}, seed {seed}: {_in_words(point, unit)}"
-                      for ((scene, _), seed), point in points.items()]  # fmt: skip
-        says[f"{region} {number} mean"] = [f"{arm.title}, mean: {_in_words(means[arm.name], unit)}"]
+        means[variant.name] = _mean_point(points)
+        says[runs] = [f"{variant.name}, {scene}, seed {seed}: {_in_words(point, unit)}"
+                      for (scene, _, seed), *point in points.itertuples()]  # fmt: skip
+        says[f"{region} {number} mean"] = [f"{variant.title}, mean: {_in_words(means[variant.name], unit)}"]
         # A marker of lines has no inside to leave empty: it is drawn thin.
         hollow = {"facecolors": "none", "edgecolors": paint} if marker not in "x+" else {"color": paint}
-        shape = {**hollow, "linewidths": 0.8} if arm.lacks else {"color": paint, "linewidths": 1.6}
-        axes.scatter(*means[arm.name], s=48, marker=marker, zorder=3, gid=f"{region} {number} mean", **shape)
-    for arm in arms:
-        ends = None if arm.control else paired_means(arm, plain_of(arm, arms), cost, quality)
+        shape = {**hollow, "linewidths": 0.8} if variant.lacks else {"color": paint, "linewidths": 1.6}
+        axes.scatter(*means[variant.name], s=48, marker=marker, zorder=3, gid=f"{region} {number} mean", **shape)
+    for variant in variants:
+        ends = None if variant.control else paired_means(variant, plain_of(variant, variants), cost, quality)
         if ends is not None:
-            arrow = {"arrowstyle": "->", "color": _paint(style, arm), "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
+            arrow = {"arrowstyle": "->", "color": _paint(style, variant), "alpha": 0.7, "shrinkA": 5, "shrinkB": 5}
             axes.annotate("", ends[1], ends[0], arrowprops=arrow)
-    best = front([means[arm.name] for arm in arms if arm.name in means and not arm.control and not arm.lacks])
+    best = front(
+        [
+            means[variant.name]
+            for variant in variants
+            if variant.name in means and not variant.control and not variant.lacks
+        ]
+    )
     if best:
         axes.plot(*zip(*best, strict=True), color=_INK, linewidth=0.9, linestyle="--", zorder=1)
     axes.set_xscale("log")
@@ -261,9 +276,9 @@ def _pareto_panel(axes: Axes, arms: Sequence[Arm], of: tuple[str, str, Value], q
     return says
 
 
-def _paint(style: Mapping[str, Style], arm: Arm) -> str:
+def _paint(style: Mapping[str, Style], variant: Variant) -> str:
     """Returns the color of the method, or of the kind if there is one method."""
-    own = style[arm.name]
+    own = style[variant.name]
     return own.color if len({one.method for one in style.values()} - {GREY}) <= 1 else own.method
 
 
@@ -276,58 +291,238 @@ def legend_below(figure: Figure, handles: Sequence[Artist]) -> None:
     figure.legend(handles=list(handles), loc="outside lower center", ncols=columns, **LEGEND)
 
 
-def _in_words(point: tuple[float, float], unit: str) -> str:
+def _in_words(point: Sequence[float], unit: str) -> str:
     cost = f"{point[0]:,.0f}" if point[0] >= 1000 else f"{point[0]:.4g}"
     return f"{point[1]:.3f} dB, {cost} {unit}"
 
 
 def paired_means(
-    arm: Arm, plain: Arm | None, cost: Value, quality: Value
+    variant: Variant, plain: Variant | None, cost: str, quality: str
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Returns where an arrow starts and ends: the means of the plain arm and of an arm over the units of both.
+    """Returns where an arrow starts and ends: the means of the plain variant and of a variant over the units of both.
 
-    None for the plain arm itself, without one, and without a common unit.
+    None for the plain variant itself, without one, and without a common unit.
     """
-    if plain is None or plain is arm:
+    if plain is None or plain is variant:
         return None
-    ours, theirs = _points(arm, cost, quality), _points(plain, cost, quality)
-    shared = ours.keys() & theirs.keys()
-    if not shared:
-        return None
-    start, end = (_mean_point({unit: points[unit] for unit in shared}) for points in (theirs, ours))
-    return start, end
+    ours, theirs = _points(variant, cost, quality), _points(plain, cost, quality)
+    shared = ours.index.intersection(theirs.index)
+    return None if shared.empty else (_mean_point(theirs.loc[shared]), _mean_point(ours.loc[shared]))
 
 
-def _points(arm: Arm, cost: Value, quality: Value) -> dict[Unit, tuple[float, float]]:
-    """Returns scene and seed -> cost and quality, where both are known."""
-    costs, qualities = arm.units(cost), arm.units(quality)
-    return {unit: (costs[unit], qualities[unit]) for unit in sorted(costs.keys() & qualities.keys())}
+def _points(variant: Variant, cost: str, quality: str) -> pd.DataFrame:
+    """Return scene, clip and seed -> cost and quality, where both are known."""
+    both = {"cost": variant.units(cost), "quality": variant.units(quality)}
+    return pd.concat(both, axis=1, join="inner").sort_index()
 
 
-def _mean_point(points: Mapping[Unit, tuple[float, float]]) -> tuple[float, float]:
-    """Returns the mean over scenes of the mean over each scene's seeds."""
-    scenes = (by_scene({unit: point[axis] for unit, point in points.items()}) for axis in (0, 1))
-    x, y = (statistics.fmean(means.values()) for means in scenes)
+def _mean_point(points: pd.DataFrame) -> tuple[float, float]:
+    """Return the mean over scenes of the mean over each scene's seeds."""
+    x, y = (statistics.fmean(by_scene(pd.Series(points[axis]))) for axis in ("cost", "quality"))
     return x, y
 
 
-def _legend(arms: Sequence[Arm]) -> list[Line2D]:
-    style = styles(arms)
-    methods = {arm.plain_label: style[arm.name].method for arm in arms if not arm.control}
+def _legend(variants: Sequence[Variant]) -> list[Line2D]:
+    style = styles(variants)
+    methods = {variant.plain_label: style[variant.name].method for variant in variants if not variant.control}
     dots = [Line2D([], [], color=paint, marker="o", linestyle="", label=name) for name, paint in methods.items()]
     # Of one method, the color is the kind's.
     dots, alone = (dots, False) if len(methods) > 1 else ([], True)
-    kinds = {style[arm.name].kind: arm for arm in arms}
+    kinds = {style[variant.name].kind: variant for variant in variants}
     shapes = [
         Line2D(
             [],
             [],
-            color=GREY if arm.control else style[arm.name].color if alone else _INK,
-            marker=style[arm.name].marker,
+            color=GREY if variant.control else style[variant.name].color if alone else _INK,
+            marker=style[variant.name].marker,
             linestyle="",
             markerfacecolor="none",
             label=kind,
         )
-        for kind, arm in kinds.items()
+        for kind, variant in kinds.items()
     ]
     return [*dots, *shapes, Line2D([], [], color=_INK, linestyle="--", linewidth=0.9, label="front of the means")]
+
+
+_MAX_NAMES_IN_PANEL = 6
+"""Largest number of names in a legend that stands within a panel."""
+
+
+def held_out_over_time(variants: Sequence[Variant], path: Path) -> bool:
+    """Draw held-out PSNR over training seconds, a panel a method, a line a run. Return whether a run has a curve."""
+    found = {
+        variant.name: [curve for some in curves_of_runs(variant).values() for curve in some] for variant in variants
+    }
+    drawn = [variant for variant in variants if found[variant.name]]
+    says: Says = {}
+
+    def draw(axes: Axes, variant: Variant, look: Style) -> None:
+        for curve in found[variant.name]:
+            name = f"curve {len(says)}"
+            axes.plot(curve.seconds, curve.psnr, **_line(look), marker=".", markersize=3, gid=name)
+            looks = zip(curve.seconds, curve.psnr, strict=True)
+            says[name] = [f"{variant.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
+
+    return _over_time(variants, drawn, draw, ("training seconds", "held-out PSNR, dB"), path, says)
+
+
+def counts_over_time(variants: Sequence[Variant], path: Path) -> bool:
+    """Draw the number of Gaussians over steps, a panel a method, a line a run; dots mark masks and pruning passes."""
+    drawn = [variant for variant in variants if any(LEDGER.exists(record.folder) for record in variant.records)]
+
+    def draw(axes: Axes, variant: Variant, look: Style) -> None:
+        for record in variant.records:
+            if LEDGER.exists(record.folder):
+                _counts(axes, look, record.folder)
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: short(value)))
+
+    return _over_time(variants, drawn, draw, ("step", "Gaussians"), path, {})
+
+
+def _over_time(
+    variants: Sequence[Variant],
+    drawn: Sequence[Variant],
+    draw: Callable[[Axes, Variant, Style], None],
+    labels: tuple[str, str],
+    path: Path,
+    says: Says,
+) -> bool:
+    """Write a panel for each method of the drawn variants. Return whether there is any."""
+    methods = list(dict.fromkeys(variant.plain_label for variant in drawn))
+    if not methods:
+        return False
+    figure, axes = panels(len(methods))
+    look = styles(variants)
+    for one, method in zip(axes, methods, strict=True):
+        for variant in drawn:
+            if variant.plain_label == method:
+                draw(one, variant, look[variant.name])
+        one.set_title(method, fontsize=10)
+        one.set_xlabel(labels[0])
+    axes[0].set_ylabel(labels[1])
+    _legends(figure, axes)
+    write_svg(figure, path, says)
+    return True
+
+
+def _counts(axes: Axes, look: Style, folder: Path) -> None:
+    changes = LEDGER.read(folder)
+    steps, nodes = count_curves(changes)
+    total = [sum(values) for values in zip(*nodes.values(), strict=True)]
+    axes.plot(steps, total, drawstyle="steps-post", **_line(look))
+    at = dict(zip(steps, total, strict=True))
+    taken = sorted({step for step, _ in marks(changes)})
+    axes.plot(taken, [at[step] for step in taken], ".", markersize=4, color=look.color, label="_")
+
+
+def frame_waterfall(variants: Sequence[Variant], path: Path) -> bool:
+    """Draws the additional time of a frame with each node and effect, a bar a variant. Returns whether a run has it."""
+    costs = {variant.name: _frame_costs(variant) for variant in variants}
+    drawn = [variant for variant in variants if costs[variant.name]]
+    if not drawn:
+        return False
+    parts = list(dict.fromkeys(part for variant in drawn for part in costs[variant.name]))
+    titles = [textwrap.wrap(variant.title, 40) for variant in drawn]
+    # A bar is as high as the most lines of a name, which would run into its neighbors'.
+    figure, (axes,) = panels(1, width=7.4, height=1.1 + max(0.34, 0.16 * max(map(len, titles)) + 0.08) * len(drawn))
+    for row, variant in enumerate(drawn):
+        left = 0.0
+        for part, ms in costs[variant.name].items():
+            index = parts.index(part)
+            hatch = "//" if part.startswith("effect") else None
+            axes.barh(row, ms, left=left, height=0.62, color=COLORS[index % len(COLORS)], hatch=hatch,
+                      edgecolor="white", linewidth=0.4, label="_")  # fmt: skip
+            left += ms
+    for index, part in enumerate(parts):
+        hatch = "//" if part.startswith("effect") else None
+        axes.barh([0], [0], color=COLORS[index % len(COLORS)], hatch=hatch, edgecolor="white", label=part)
+    axes.set_yticks(range(len(drawn)), ["\n".join(lines) for lines in titles])
+    axes.invert_yaxis()
+    axes.axvline(0, color=GREY, linewidth=0.8)
+    axes.set_xlabel("milliseconds that a frame takes longer with it")
+    figure.legend(loc="outside lower center", ncols=5, **LEGEND)
+    write_svg(figure, path)
+    return True
+
+
+def _frame_costs(variant: Variant) -> dict[str, float]:
+    """Returns node or effect -> mean milliseconds over the runs that recorded it."""
+    found: dict[str, list[float]] = {}
+    for costs in filter(None, (COSTS.find(record.folder) for record in variant.records)):
+        parts = {name: node.ms for name, node in costs.nodes.items()}
+        for part, ms in (parts | {f"effect: {name}": ms for name, ms in costs.effects.items()}).items():
+            found.setdefault(part, []).append(ms)
+    return {part: statistics.fmean(values) for part, values in found.items()}
+
+
+def _line(look: Style) -> dict[str, Any]:
+    return {"color": look.color, "linestyle": look.dashes, "linewidth": 1.2, "alpha": 0.85, "label": look.kind}
+
+
+def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
+    """Adds a legend to each panel, or one below all of them if it would hide the curves."""
+    named = [dict(zip(*reversed(one.get_legend_handles_labels()), strict=True)) for one in axes]
+    if max(map(len, named)) <= _MAX_NAMES_IN_PANEL:
+        for one, once in zip(axes, named, strict=True):
+            one.legend(once.values(), once.keys(), **LEGEND)
+        return
+    once = {name: handle for some in named for name, handle in some.items()}
+    legend_below(figure, list(once.values()))
+
+
+_DASHES_OF_KIND = {"plain": "-", "paper": "--", "paper_short": "--", "removal": ":"}
+
+
+def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> None:
+    """Writes a PNG: held-out PSNR over training seconds and over milliseconds a frame, without controls.
+
+    Curves are means over scenes and seeds at each look. Without curves, only the end of training is drawn. Raises
+    ValueError if no run has a held-out PSNR.
+    """
+    shown = [
+        variant for variant in variants if not variant.control and variant.mean(_held_out(protocol.psnr)) is not None
+    ]
+    if not shown:
+        raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
+    figure, (training, frame) = panels(2, width=4.6, height=4.0)
+    for variant in shown:
+        _over_training(training, variant, shown, protocol)
+        _draw_points(frame, variant, shown, "ms/frame", protocol)
+    training.set_xlabel("training seconds")
+    frame.set_xlabel("milliseconds a frame")
+    training.set_ylabel("held-out PSNR, dB")
+    legend_below(figure, training.get_legend_handles_labels()[0])
+    FigureCanvasAgg(figure)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150, facecolor="white", metadata={"Software": None})
+
+
+def _over_training(axes: Axes, variant: Variant, shown: Sequence[Variant], protocol: Protocol) -> None:
+    curves = list(curves_of(variant).values())
+    if not curves:
+        _draw_points(axes, variant, shown, "train s", protocol)
+        return
+    mean = mean_curve(curves)
+    look, end = styles(shown)[variant.name], [len(mean.seconds) - 1]
+    dashes = _DASHES_OF_KIND.get(look.kind, "-.")
+    paint = _paint(styles(shown), variant)
+    axes.plot(
+        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(variant)
+    )
+
+
+def _draw_points(axes: Axes, variant: Variant, shown: Sequence[Variant], cost: str, protocol: Protocol) -> None:
+    """Draw the mean, and every run small and pale."""
+    points = _points(variant, cost, _held_out(protocol.psnr))
+    if points.empty:
+        return
+    paint = _paint(styles(shown), variant)
+    axes.scatter(points["cost"], points["quality"], s=8, color=paint, alpha=0.5)
+    marker = styles(shown)[variant.name].marker
+    axes.scatter(*_mean_point(points), s=44, color=paint, marker=marker, label=_label(variant), zorder=3)
+
+
+def _label(variant: Variant) -> str:
+    return (
+        f"{variant.title} (machine not quiet)" if variant.busy("frames") or variant.busy("training") else variant.title
+    )

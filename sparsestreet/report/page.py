@@ -1,19 +1,24 @@
 """A sweep's report as one HTML file that needs no network and no other file."""
 
+import base64
+import io
+import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
 
-from sparsestreet.records.failures import FailedRun
-from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.grid import ABSENT, Cell, Grid
-from sparsestreet.report.notes import frames_steady, training_steady
+from PIL import Image
 
-_THEIRS = ", paper"
-"""The end of a heading whose column has published numbers."""
-_MANY = 14
+from sparsestreet.pictures.images import drawn_views, picture_path
+from sparsestreet.records.run import FailedRun
+from sparsestreet.records.summary import QUALITY
+from sparsestreet.report.collect import RunRecord
+from sparsestreet.report.tables import ABSENT, THEIRS, Cell, Grid, frames_steady, training_steady, without_empty
+from sparsestreet.report.variants import Variant
+
+_MAX_FULL_SIZE_COLUMNS = 14
 """Columns from which on a table is printed smaller."""
 _HERE = Path(__file__).parent
 _NOTHING_FROM_OUTSIDE = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
@@ -33,7 +38,7 @@ class Page:
     """The JSON of ``comparison.comparison_data``."""
     records: Sequence[RunRecord]
     failures: Sequence[tuple[Path, FailedRun]]
-    verdict: Sequence[str] = ()
+    summary_line: Sequence[str] = ()
     """Sentences that say what follows from the numbers; none where the runs are too few."""
 
 
@@ -44,7 +49,7 @@ def html(page: Page) -> str:
         f"<h1>{escape(page.title)}</h1>",
         f"<p class='soft'>{len(page.records)} runs with a record, {len(page.failures)} failed. "
         "Every number links to the runs that it is of, with their records, configurations and commits.</p>",
-        _verdict(page.verdict),
+        _summary_line(page.summary_line),
         _navigation(page),
         _notes(page.notes),
         *(_grid(grid, sets) for grid in page.grids),
@@ -84,7 +89,7 @@ def _notes(notes: Sequence[str]) -> str:
     return "<ul class='notes'>" + "".join(f"<li>{escape(note)}</li>" for note in notes) + "</ul>" if notes else ""
 
 
-def _verdict(sentences: Sequence[str]) -> str:
+def _summary_line(sentences: Sequence[str]) -> str:
     if not sentences:
         return ""
     return "<section id='verdict'>" + "".join(f"<p>{escape(one)}</p>" for one in sentences) + "</section>"
@@ -97,35 +102,24 @@ def _sets(grids: Sequence[Grid]) -> dict[tuple[str, ...], str]:
 
 
 def _grid(grid: Grid, sets: Mapping[tuple[str, ...], str]) -> str:
-    grid = _without_empty(grid)
+    header, rows = without_empty(grid.header, grid.rows)
+    grid = replace(grid, header=tuple(header), rows=tuple(rows))
     above = "".join(f"<th class='above' colspan='{span}'>{escape(text)}</th>" for text, span in grid.spans)
     above = f"<tr>{above}</tr>" if any(text for text, _ in grid.spans) else ""
     heads = "".join(
-        f"<th{' class=theirs' if heading.endswith(_THEIRS) else ''}>{escape(heading)}</th>"
-        for _, heading in grid.header
+        f"<th{' class=theirs' if heading.endswith(THEIRS) else ''}>{escape(heading)}</th>" for _, heading in grid.header
     )
     rows = "\n".join("<tr>" + "".join(_cell(cell, sets) for cell in row) + "</tr>" for row in grid.rows)
-    wide = "wide many" if len(grid.header) > _MANY else "wide"
+    wide = "wide many" if len(grid.header) > _MAX_FULL_SIZE_COLUMNS else "wide"
     return (
         f"<section id='{grid.name}'><h2>{escape(grid.title)}</h2>\n<div class='{wide}' tabindex='0'><table><thead>"
         f"{above}<tr>{heads}</tr></thead>\n<tbody>\n{rows}\n</tbody></table></div>\n{_notes(grid.notes)}</section>"
     )
 
 
-def _without_empty(grid: Grid) -> Grid:
-    """Returns the table without columns for published numbers of which there are none."""
-    kept = [
-        index
-        for index, (_, heading) in enumerate(grid.header)
-        if not heading.endswith(_THEIRS) or any(row[index].text != ABSENT for row in grid.rows)
-    ]
-    rows = tuple(tuple(row[index] for index in kept) for row in grid.rows)
-    return replace(grid, header=tuple(grid.header[index] for index in kept), rows=rows)
-
-
 def _cell(cell: Cell, sets: Mapping[tuple[str, ...], str]) -> str:
     text = f"<b>{escape(cell.text)}</b>" if cell.bold else escape(cell.text)
-    if cell.runs and cell.text != "-":
+    if cell.runs and cell.text != ABSENT:
         target = sets.get(cell.runs, f"run-{cell.runs[0]}")
         text = f"<a href='#{escape(target)}'>{text}</a>"
     title = f" title='{escape(cell.exact)}'" if cell.exact else ""
@@ -225,3 +219,72 @@ def _configurations(records: Sequence[RunRecord]) -> list[str]:
         + "</pre></details>"
         for key, record in once.items()
     ]
+
+
+WIDTH = 640
+"""Pixels; wider pictures are scaled down to this width."""
+VIEWS = 2
+"""Number of views of each scene."""
+
+
+def comparison_data(variants: Sequence[Variant]) -> str | None:
+    """Returns JSON of the views with their images as data URLs, truth first; None if there is no view to compare.
+
+    Each scene shows one seed, which most of the variants have (the lowest of several), and the first ``VIEWS`` views
+    that evaluation drew.
+    """
+    views = []
+    scenes = sorted({record.summary.run.scene for variant in variants for record in variant.records})
+    for scene in scenes:
+        seed = _seed_of_most(variants, scene)
+        shown = [(variant, record) for variant in variants if (record := _record(variant, scene, seed)) is not None]
+        keys = drawn_views(shown[0][1].folder / "pictures")[:VIEWS] if shown else []
+        views += [view for key in keys if (view := _view(scene, seed, key, shown)) is not None]
+    # A tag inside the text would end the script element.
+    return json.dumps(views).replace("</", "<\\/") if views else None
+
+
+def _seed_of_most(variants: Sequence[Variant], scene: str) -> int:
+    seeds = sorted({record.summary.run.seed for variant in variants for record in variant.records})
+    return max(seeds, key=lambda seed: sum(_record(variant, scene, seed) is not None for variant in variants))
+
+
+def _record(variant: Variant, scene: str, seed: int) -> RunRecord | None:
+    for record in variant.records:
+        run = record.summary.run
+        if (run.scene, run.seed) == (scene, seed) and run.split != "none":
+            return record
+    return None
+
+
+def _view(
+    scene: str, seed: int, key: tuple[int, int], shown: Sequence[tuple[Variant, RunRecord]]
+) -> dict[str, object] | None:
+    pictures = [
+        (variant, record, picture_path(record.folder / "pictures", *key, "render")) for variant, record in shown
+    ]
+    pictures = [(variant, record, path) for variant, record, path in pictures if path.is_file()]
+    truth = picture_path(pictures[0][1].folder / "pictures", *key, "truth") if pictures else None
+    if truth is None or not truth.is_file():
+        return None
+    images = [{"name": "truth", "label": "truth", "data": _embedded(truth)}]
+    for variant, record, path in pictures:
+        label = f"{variant.title}, {_psnr(record, key)}{record.summary.gaussians_total:,} Gaussians"
+        images.append({"name": variant.title, "label": label, "data": _embedded(path)})
+    return {"name": f"{scene}, seed {seed}, frame {key[0]}, camera {key[1]}", "images": images}
+
+
+def _psnr(record: RunRecord, key: tuple[int, int]) -> str:
+    images = QUALITY[record.summary.main_split].find(record.folder) or ()
+    found = [image.regions["full"].psnr for image in images if (image.frame, image.camera) == key]
+    return f"{found[0]:.2f} dB, " if found else ""
+
+
+def _embedded(path: Path) -> str:
+    with Image.open(path) as image:
+        small = image.convert("RGB")
+        if small.width > WIDTH:
+            small = small.resize((WIDTH, round(small.height * WIDTH / small.width)), Image.Resampling.LANCZOS)
+        buffer = io.BytesIO()
+        small.save(buffer, "WEBP", quality=82)
+    return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -3,11 +3,10 @@
 from pathlib import Path
 
 from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
-from sparsestreet.records.held_out import HELD_OUT_CURVE
-from sparsestreet.records.quality import HELD_OUT, TRAINING
+from sparsestreet.records.curves import HELD_OUT_CURVE
 from sparsestreet.records.run import RunDescription
-from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.notes import frames_steady, training_steady
+from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
+from sparsestreet.report.tables import frames_steady, training_steady
 
 FALL = 0.5
 """dB by which a probe of held-out views may end below its best look without a word: looks vary by a few tenths."""

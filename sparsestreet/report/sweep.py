@@ -5,23 +5,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
-from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
+from sparsestreet.records.run import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import write_atomically
-from sparsestreet.report.arms import Arm, arms, busy_arms, incomplete, plain_of, why_apart
-from sparsestreet.report.beside import beside_the_path
 from sparsestreet.report.collect import RunRecord, check_definitions, collect
-from sparsestreet.report.comparison import comparison_data
-from sparsestreet.report.costs import what_arms_cost
-from sparsestreet.report.curves import time_to_quality
-from sparsestreet.report.effects import effects_alike, what_effects_cost
-from sparsestreet.report.figures import PARETO_COSTS, pareto
-from sparsestreet.report.figures_time import counts_over_time, frame_waterfall, held_out_over_time
-from sparsestreet.report.grid import Grid, comma_separated, latex, markdown
-from sparsestreet.report.layouts import paper_table
-from sparsestreet.report.page import Page, html
-from sparsestreet.report.presets import rendered_otherwise
-from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality
-from sparsestreet.report.verdict import verdict
+from sparsestreet.report.costs import (
+    beside_the_path,
+    effects_alike,
+    rendered_otherwise,
+    time_to_quality,
+    what_effects_cost,
+    what_variants_cost,
+)
+from sparsestreet.report.figures import PARETO_COSTS, counts_over_time, frame_waterfall, held_out_over_time, pareto
+from sparsestreet.report.page import Page, comparison_data, html
+from sparsestreet.report.paper import paper_table
+from sparsestreet.report.tables import Grid, comma_separated, latex, markdown
+from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, summary_line
+from sparsestreet.report.variants import Variant, busy_variants, incomplete, plain_of, variants, why_apart
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class SweepReport:
     folder: Path
     grids: tuple[Grid, ...]
     notes: tuple[str, ...]
-    verdict: tuple[str, ...]
+    summary_line: tuple[str, ...]
 
 
 def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIVESTUDIO) -> SweepReport:
@@ -47,16 +47,16 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     """
     failures = read_failures(sweep)
     records = sweep_records(sweep)
-    found = arms(records)
+    found = variants(records)
     grids = _grids(found, failures, protocol, name)
-    said = verdict(found, protocol)
+    said = summary_line(found, protocol)
     folder = sweep / "report"
     figures, absent = _figures(found, protocol, folder / "figures")
     notes = [
         *incomplete(found),
         *why_apart(found),
         *_caps(found),
-        *busy_arms(found),
+        *busy_variants(found),
         *_effects_alike(found),
         *_baseline(found),
         *_unfinished(records),
@@ -73,7 +73,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
         pictures=comparison_data(found),
         records=records,
         failures=failures,
-        verdict=said,
+        summary_line=said,
     )
     write_atomically(folder / "index.html", html(page))
     return SweepReport(folder, tuple(grids), tuple(notes), said)
@@ -90,11 +90,11 @@ def sweep_records(sweep: Path) -> list[RunRecord]:
 
 
 def _grids(
-    found: Sequence[Arm], failures: Sequence[tuple[Path, FailedRun]], protocol: Protocol, name: str | None
+    found: Sequence[Variant], failures: Sequence[tuple[Path, FailedRun]], protocol: Protocol, name: str | None
 ) -> list[Grid]:
     grids = [
         paper_table(found, failures, protocol, name),
-        what_arms_cost(found),
+        what_variants_cost(found),
         what_effects_cost(found) if effects_alike(found) is None else None,
         differences(found, protocol),
         matched_quality(found, protocol),
@@ -106,58 +106,60 @@ def _grids(
     return [grid for grid in grids if grid is not None and grid.rows]
 
 
-def _figures(found: Sequence[Arm], protocol: Protocol, folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
-    """Returns caption and SVG of each figure, and notes on figures that the records cannot give."""
-    drawn, absent = [], []
-
-    def take(written: bool, name: str, caption: str, lacking: str) -> None:
-        if written:
-            drawn.append((caption, (folder / f"{name}.svg").read_text(encoding="utf-8")))
-        else:
-            (folder / f"{name}.svg").unlink(missing_ok=True)
-            absent.append(lacking)
-
-    for cost in PARETO_COSTS:
-        name = f"pareto_{cost[0]}"
-        take(
-            pareto(found, protocol, cost, folder / f"{name}.svg"),
-            name,
-            f"Held-out PSNR against {cost[1]}: every run small, every arm's mean large, arrows from plain to pruned "
-            "over the scenes and seeds that both have, the front of the means dashed, controls grey. Hollow: the mean "
-            "of an arm that lacks runs, which is in no front."
-            + "".join(f" {note}." for note in (busy_arms(found) if cost[0] in ("frame", "training") else ())),
-            f"no figure of quality against {cost[1]}: no run has both",
-        )
-    take(
-        held_out_over_time(found, folder / "held_out.svg"),
-        "held_out",
+_QUALITY_CAPTION = (
+    "every run small, every arm's mean large, arrows from plain to pruned over the scenes and seeds that both have, "
+    "the front of the means dashed, controls grey. Hollow: the mean of an arm that lacks runs, which is in no front."
+)
+_OTHER_FIGURES = {
+    "held_out": (
+        held_out_over_time,
         "PSNR of a fixed probe of held-out views over the seconds of training, evaluation left out; a line a run.",
         "no curves of held-out PSNR over seconds: no run has curves/held_out.csv",
-    )
-    take(
-        counts_over_time(found, folder / "counts.svg"),
-        "counts",
+    ),
+    "counts": (
+        counts_over_time,
         "Gaussians over the steps, a line a run; dots where masks or passes of pruning took some.",
         "no counts over time: no run has records/counts.csv",
-    )
-    take(
-        frame_waterfall(found, folder / "waterfall.svg"),
-        "waterfall",
+    ),
+    "waterfall": (
+        frame_waterfall,
         "What a frame takes longer with each node class and effect, mean over an arm's runs; nodes that hide each "
         "other cost less together than the sum.",
         "no milliseconds by node and effect: no run has records/cost.json",
-    )
+    ),
+}
+"""Name of a file -> what draws it, its caption, and the note where no run has what it shows."""
+
+
+def _figures(found: Sequence[Variant], protocol: Protocol, folder: Path) -> tuple[list[tuple[str, str]], list[str]]:
+    """Return caption and SVG of each figure, and notes on figures that the records cannot give."""
+    known = {}
+    for cost in PARETO_COSTS:
+        busy = busy_variants(found) if cost[0] in ("frame", "training") else ()
+        known[f"pareto_{cost[0]}"] = (
+            lambda variants, path, cost=cost: pareto(variants, protocol, cost, path),
+            f"Held-out PSNR against {cost[1]}: {_QUALITY_CAPTION}" + "".join(f" {note}." for note in busy),
+            f"no figure of quality against {cost[1]}: no run has both",
+        )
+    drawn, absent = [], []
+    for name, (draw, caption, lacking) in (known | _OTHER_FIGURES).items():
+        path = folder / f"{name}.svg"
+        if draw(found, path):
+            drawn.append((caption, path.read_text(encoding="utf-8")))
+        else:
+            path.unlink(missing_ok=True)  # that of an earlier report
+            absent.append(lacking)
     return drawn, absent
 
 
-def _effects_alike(found: Sequence[Arm]) -> list[str]:
+def _effects_alike(found: Sequence[Variant]) -> list[str]:
     alike = effects_alike(found)
     return [f"{alike}: records/cost.json of a run has what each costs and brings"] if alike else []
 
 
-def _baseline(found: Sequence[Arm]) -> list[str]:
-    """Says why there are no differences: no arm is the plain one of another."""
-    if len(found) < 2 or any(plain_of(arm, found) not in (None, arm) for arm in found):
+def _baseline(found: Sequence[Variant]) -> list[str]:
+    """Says why there are no differences: no variant is the plain one of another."""
+    if len(found) < 2 or any(plain_of(variant, found) not in (None, variant) for variant in found):
         return []
     return [
         "no arm is a baseline, so no table of differences and no arrows: add sparsify=none to the sweep, or compare "
@@ -165,8 +167,8 @@ def _baseline(found: Sequence[Arm]) -> list[str]:
     ]
 
 
-def _caps(found: Sequence[Arm]) -> list[str]:
-    held = sorted({arm.title for arm in found for record in arm.records if record.summary.run.caps})
+def _caps(found: Sequence[Variant]) -> list[str]:
+    held = sorted({variant.title for variant in found for record in variant.records if record.summary.run.caps})
     return [f"counts held down by max_gaussians, so that shares of them say little: {', '.join(held)}"] if held else []
 
 

@@ -1,20 +1,30 @@
-"""The cost of getting smaller: paired differences, and the best arm of a sweep at one quality or one size."""
+"""The cost of getting smaller: paired differences, and the best variant of a sweep at one quality or one size."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
+
+import pandas as pd
 
 from sparsestreet.metrics.definitions import Protocol
-from sparsestreet.records.quality import HELD_OUT
-from sparsestreet.records.summary import RunSummary
-from sparsestreet.report.arms import Arm, Unit, Value, busy_arms, by_scene, mean_over_scenes, plain_of
-from sparsestreet.report.grid import Cell, Grid, number_cell
-from sparsestreet.report.intervals import CONFIDENCE, ConfidenceInterval, t_interval
-from sparsestreet.report.notes import BUSY, CAPPED, CLOCKS
+from sparsestreet.records.summary import HELD_OUT
+from sparsestreet.report.collect import by_scene, mean_over_scenes
+from sparsestreet.report.tables import (
+    BUSY,
+    CAPPED,
+    CONFIDENCE,
+    Cell,
+    ConfidenceInterval,
+    Grid,
+    number_cell,
+    t_interval,
+)
+from sparsestreet.report.variants import Variant, busy_variants, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
-"""Losses of full-image held-out PSNR, dB, that a smaller arm may have."""
+"""Losses of full-image held-out PSNR, dB, that a smaller variant may have."""
 SHARES = (0.25, 0.5, 0.75)
-"""Shares of the plain arm's Gaussians that a smaller arm may keep."""
+"""Shares of the plain variant's Gaussians that a smaller variant may keep."""
 
 
 @dataclass(frozen=True)
@@ -22,16 +32,13 @@ class Measure:
     """A column of differences."""
 
     heading: str
-    value: Value
+    column: str
+    """Of ``run_frame``."""
     text: str
     relative: bool
     """Whether the difference is in per cent of the plain run's value."""
     clock: str = ""
     """What is timed, a key of ``CLOCKS``; empty: no time."""
-
-    def steady(self, run: RunSummary) -> float | None:
-        """Returns the value of a run, or None for a time of a machine that was not quiet."""
-        return self.value(run) if not self.clock or CLOCKS[self.clock](run) else None
 
 
 def measures(protocol: Protocol) -> tuple[Measure, ...]:
@@ -45,59 +52,56 @@ def measures(protocol: Protocol) -> tuple[Measure, ...]:
     )
     return (
         *(Measure(heading, _held_out(metric), text, False) for heading, metric, text in quality),
-        Measure("Gaussians", lambda run: float(run.gaussians_total), "{:+.1f}", True),
-        Measure("MB", lambda run: run.bytes_total / 1e6, "{:+.1f}", True),
-        Measure("ms/frame", lambda run: run.latency.p50, "{:+.1f}", True, "frames"),
-        Measure("train s", lambda run: run.run.training_seconds, "{:+.1f}", True, "training"),
+        Measure("Gaussians", "Gaussians", "{:+.1f}", True),
+        Measure("MB", "MB", "{:+.1f}", True),
+        Measure("ms/frame", "ms/frame", "{:+.1f}", True, "frames"),
+        Measure("train s", "train s", "{:+.1f}", True, "training"),
     )
 
 
-def _held_out(metric: str) -> Value:
-    return lambda run: run.mean(metric, HELD_OUT)
+def _held_out(metric: str) -> str:
+    return f"{HELD_OUT} {metric}"
 
 
-def paired(arm: Arm, plain: Arm, value: Value, relative: bool = False) -> ConfidenceInterval | None:
-    """Returns the difference to the plain arm over the pairs of scene and seed that both arms have."""
-    ours, theirs = arm.units(value), plain.units(value)
-    differences = {
-        unit: 100 * (ours[unit] / theirs[unit] - 1) if relative else ours[unit] - theirs[unit]
-        for unit in ours.keys() & theirs.keys()
-        if not relative or theirs[unit]
-    }
-    return interval_over_scenes(differences)
+def paired(
+    variant: Variant, plain: Variant, column: str, relative: bool = False, clock: str = ""
+) -> ConfidenceInterval | None:
+    """Return the difference to the plain variant over the pairs of scene and seed that both have.
 
-
-def interval_over_scenes(values: dict[Unit, float]) -> ConfidenceInterval | None:
-    """Returns the t interval over scenes, each with the mean of its seeds; over the seeds of a single scene.
-
-    >>> interval_over_scenes({(("street", ""), 0): 0.1, (("street", ""), 1): 0.3, (("park", ""), 0): 0.4}).n
-    2
+    ``relative``: in per cent of the plain variant's number. With a ``clock``, runs of a busy machine are left out.
     """
-    scenes = by_scene(values)
-    return t_interval(list((scenes if len(scenes) > 1 else values).values()))
+    ours, theirs = variant.units(column, clock=clock), plain.units(column, clock=clock)
+    differences = 100 * (ours / theirs[theirs != 0] - 1) if relative else ours - theirs
+    return interval_over_scenes(differences.dropna())
 
 
-def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """Returns the table that compares every arm with the plain arm of its method at the same place."""
-    shown = [one for one in measures(protocol) if any(arm.mean(one.value) is not None for arm in arms)]
+def interval_over_scenes(units: pd.Series) -> ConfidenceInterval | None:
+    """Return the t interval over scenes, each with the mean of its seeds; over the seeds of a single scene."""
+    scenes = by_scene(units)
+    return t_interval((scenes if len(scenes) > 1 else units).tolist())
+
+
+def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
+    """Returns the table that compares every variant with the plain variant of its method at the same place."""
+    shown = [one for one in measures(protocol) if any(variant.mean(one.column) is not None for variant in variants)]
     rows, alone = [], []
-    for arm in arms:
-        plain = plain_of(arm, arms)
-        if arm.sparsify == "none":
+    for variant in variants:
+        plain = plain_of(variant, variants)
+        if variant.sparsify == "none":
             continue
         if plain is None:
-            alone.append(arm.name)
+            alone.append(variant.name)
             continue
-        runs = tuple(record.folder.name for one in (arm, plain) for record in one.records)
-        found = [paired(arm, plain, one.steady, one.relative) for one in shown]
+        runs = variant.run_names + plain.run_names
+        found = [paired(variant, plain, one.column, one.relative, one.clock) for one in shown]
         n = max((interval.n for interval in found if interval), default=0)
         cells = [
             Cell(BUSY, runs=runs)
-            if interval is None and one.clock and (arm.busy(one.clock) or plain.busy(one.clock))
+            if interval is None and one.clock and (variant.busy(one.clock) or plain.busy(one.clock))
             else difference_cell(interval, one.text, n, runs)
             for interval, one in zip(found, shown, strict=True)
         ]
-        rows.append((Cell(f"{arm.title} - {_named(plain)}", runs=runs), Cell(str(n), runs=runs), *cells))
+        rows.append((Cell(f"{variant.title} - {_named(plain)}", runs=runs), Cell(str(n), runs=runs), *cells))
     notes = [
         f"differences paired by scene and seed, mean [{100 * CONFIDENCE:.0f} % t interval]; n: scenes, each the mean "
         "of its seeds, or the seeds of a single scene; bold where the interval excludes 0, never with n = 1",
@@ -106,23 +110,23 @@ def differences(arms: Sequence[Arm], protocol: Protocol) -> Grid:
     if alone:
         notes.append(f"no plain run (or several) at the same place to compare with: {', '.join(alone)}")
     header = (("", "arm - plain"), ("", "n"), *(("", f"{one.heading}{', %' if one.relative else ''}") for one in shown))
-    notes += [*_caps(arms), *busy_arms(arms)]
+    notes += [*_caps(variants), *busy_variants(variants)]
     return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
 
 
-def is_capped(plain: Arm) -> bool:
-    """Whether a limit ended the growth of a run of the arm."""
+def is_capped(plain: Variant) -> bool:
+    """Whether a limit ended the growth of a run of the variant."""
     return any(record.summary.run.caps for record in plain.records)
 
 
-def _named(plain: Arm) -> str:
-    """Returns the name of a plain arm, marked where its count is a limit's."""
+def _named(plain: Variant) -> str:
+    """Returns the name of a plain variant, marked where its count is a limit's."""
     return f"{plain.name} {CAPPED}" if is_capped(plain) else plain.name
 
 
-def _caps(arms: Sequence[Arm]) -> tuple[str, ...]:
-    """Says what a share of a marked arm's Gaussians is a share of."""
-    held = [arm.name for arm in arms if arm.sparsify == "none" and is_capped(arm)]
+def _caps(variants: Sequence[Variant]) -> tuple[str, ...]:
+    """Says what a share of a marked variant's Gaussians is a share of."""
+    held = [variant.name for variant in variants if variant.sparsify == "none" and is_capped(variant)]
     said = "held down by max_gaussians, so that a share of its Gaussians is a share of that limit"
     return (f"{CAPPED} {', '.join(held)}: {said}",) if held else ()
 
@@ -149,52 +153,67 @@ def _exactly(interval: ConfidenceInterval) -> str:
 
 @dataclass(frozen=True)
 class _Candidate:
-    arm: Arm
-    plain: Arm
-    loss: float
-    """dB; positive if it is worse."""
+    """A variant beside its plain one, over the scenes and seeds that both have."""
+
+    variant: Variant
+    plain: Variant
+    gain: ConfidenceInterval
+    """dB, negative if the variant is worse."""
     share: float
-    """Share of the plain arm's Gaussians that remains."""
+    """Per cent of the plain variant's Gaussians that remain."""
+
+    @property
+    def loss(self) -> float:
+        """What it loses, dB; negative if it is better."""
+        return -self.gain.mean
 
 
-def _candidates(plain: Arm, arms: Sequence[Arm], protocol: Protocol) -> list[_Candidate]:
+def _candidates(plain: Variant, variants: Sequence[Variant], protocol: Protocol) -> list[_Candidate]:
     found = []
-    for arm in arms:
-        if plain_of(arm, arms) is not plain:
+    for variant in variants:
+        if plain_of(variant, variants) is not plain:
             continue
-        loss = paired(arm, plain, _held_out(protocol.psnr))
-        share = paired(arm, plain, lambda run: float(run.gaussians_total), relative=True)
-        if loss is not None and share is not None:
-            found.append(_Candidate(arm, plain, -loss.mean, 1 + share.mean / 100))
+        gain = paired(variant, plain, _held_out(protocol.psnr))
+        share = paired(variant, plain, "Gaussians", relative=True)
+        if gain is not None and share is not None:
+            found.append(_Candidate(variant, plain, gain, 100 * (1 + share.mean / 100)))
     return found
 
 
-def matched_quality(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """Returns the arms with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
-    rows, notes = [], [f"{_OF_THIS_SWEEP}: plain counts as its own candidate", _NO_CONTROLS]
-    for plain in (arm for arm in arms if arm.sparsify == "none"):
-        for most in LOSSES:
-            allowed = [one for one in _candidates(plain, arms, protocol) if one.loss <= most]
-            best, control = (min(some, key=lambda one: one.share, default=None) for some in _parted(allowed))
-            rows.append((Cell(f"{_named(plain)}, at most {most:g} dB"), *_chosen(best)))
-            if control is not None and (best is None or control.share < best.share):
-                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is smaller")
-    notes += [*_caps(arms), *busy_arms(arms)]
-    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, tuple(rows), tuple(notes))
+def matched_quality(variants: Sequence[Variant], protocol: Protocol) -> Grid:
+    """Return the variants with the fewest Gaussians for each loss of ``LOSSES``; controls are only named."""
+    limits = {f"at most {most:g} dB": most for most in LOSSES}
+    rows, notes = _matched(variants, protocol, limits, "loss", "share", "smaller")
+    notes = (f"{_OF_THIS_SWEEP}: plain counts as its own candidate", _NO_CONTROLS, *notes)
+    return Grid("matched_quality", "Matched quality: the smallest arm", _CHOSEN, rows, notes)
 
 
-def matched_budget(arms: Sequence[Arm], protocol: Protocol) -> Grid:
-    """Returns the arms with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
-    rows, notes = [], [_OF_THIS_SWEEP, _NO_CONTROLS]
-    for plain in (arm for arm in arms if arm.sparsify == "none"):
-        for share in SHARES:
-            allowed = [one for one in _candidates(plain, arms, protocol) if one.share <= share]
-            best, control = (min(some, key=lambda one: one.loss, default=None) for some in _parted(allowed))
-            rows.append((Cell(f"{_named(plain)}, at most {100 * share:g} % of its Gaussians"), *_chosen(best)))
-            if control is not None and (best is None or control.loss < best.loss):
-                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is better")
-    notes += [*_caps(arms), *busy_arms(arms)]
-    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, tuple(rows), tuple(notes))
+def matched_budget(variants: Sequence[Variant], protocol: Protocol) -> Grid:
+    """Return the variants with the best held-out PSNR for each share of ``SHARES``; controls are only named."""
+    limits = {f"at most {100 * share:g} % of its Gaussians": 100 * share for share in SHARES}
+    rows, notes = _matched(variants, protocol, limits, "share", "loss", "better")
+    notes = (_OF_THIS_SWEEP, _NO_CONTROLS, *notes)
+    return Grid("matched_budget", "Matched budget: the best arm", _CHOSEN, rows, notes)
+
+
+def _matched(
+    variants: Sequence[Variant], protocol: Protocol, limits: Mapping[str, float], limited: str, least: str, word: str
+) -> tuple[tuple[tuple[Cell, ...], ...], tuple[str, ...]]:
+    """Return a row and notes for each plain variant and limit: of what is within it, the candidate with the least."""
+    rows, notes = [], []
+    cost = attrgetter(least)
+    for plain in (variant for variant in variants if variant.sparsify == "none"):
+        candidates = _candidates(plain, variants, protocol)
+        for said, most in limits.items():
+            allowed = [one for one in candidates if getattr(one, limited) <= most]
+            best, control = (
+                min((one for one in allowed if bool(one.variant.control) == controls), key=cost, default=None)
+                for controls in (False, True)
+            )
+            rows.append((Cell(f"{_named(plain)}, {said}"), *_chosen(best)))
+            if control is not None and (best is None or cost(control) < cost(best)):
+                notes.append(f"{rows[-1][0].text}: {_in_words(control)} is {word}")
+    return tuple(rows), (*notes, *_caps(variants), *busy_variants(variants))
 
 
 _OF_THIS_SWEEP = "of the arms of this sweep as they were run: nothing is interpolated"
@@ -208,36 +227,76 @@ _CHOSEN = tuple(
 )
 
 
-def _parted(candidates: Sequence[_Candidate]) -> tuple[list[_Candidate], list[_Candidate]]:
-    """Returns those that are no controls, and the controls."""
-    controls = [one for one in candidates if one.arm.control]
-    return [one for one in candidates if not one.arm.control], controls
-
-
 def _in_words(one: _Candidate) -> str:
-    return f"{one.arm.title}, {-one.loss:+.2f} dB at {100 * one.share:.0f} % of the Gaussians,"
+    return f"{one.variant.title}, {-one.loss:+.2f} dB at {one.share:.0f} % of the Gaussians,"
 
 
 def _chosen(best: _Candidate | None) -> tuple[Cell, ...]:
     if best is None:
         return (Cell("none of this sweep"), *[Cell()] * (len(_CHOSEN) - 2))
-    runs = tuple(record.folder.name for record in best.arm.records)
+    runs = best.variant.run_names
 
-    def mean(value: Value, form: str, clock: str = "") -> Cell:
-        ours, theirs = best.arm.units(value), best.plain.units(value)
-        found = mean_over_scenes({unit: ours[unit] for unit in ours.keys() & theirs.keys()})
-        return number_cell(found, form, runs, best.arm.busy(clock) if clock else "")
+    def mean(column: str, form: str, clock: str = "") -> Cell:
+        ours, theirs = best.variant.units(column), best.plain.units(column)
+        found = mean_over_scenes(ours.reindex(ours.index.intersection(theirs.index)))
+        return number_cell(found, form, runs, best.variant.busy(clock) if clock else "")
 
     numbers = (
         number_cell(-best.loss, "{:+.2f}", runs),
-        number_cell(100 * best.share, "{:.0f}", runs),
-        mean(lambda run: float(run.gaussians_total), "{:,.0f}"),
-        mean(lambda run: run.bytes_total / 1e6, "{:.2f}"),
-        mean(lambda run: run.latency.p50, "{:.2f}", "frames"),
-        mean(_minutes, "{:.2f}", "training"),
+        number_cell(best.share, "{:.0f}", runs),
+        mean("Gaussians", "{:,.0f}"),
+        mean("MB", "{:.2f}"),
+        mean("ms/frame", "{:.2f}", "frames"),
+        mean("train minutes", "{:.2f}", "training"),
     )
-    return (Cell(best.arm.title, runs=runs), *numbers)
+    return (Cell(best.variant.title, runs=runs), *numbers)
 
 
-def _minutes(run: RunSummary) -> float | None:
-    return None if run.run.training_seconds is None else run.run.training_seconds / 60
+LOSS = 0.3
+"""dB of full-image held-out PSNR that a smaller variant may lose on average."""
+MIN_PAIRS = 3
+"""Pairs of scenes, or of seeds of one scene, below which an interval says next to nothing: with two, a t interval is
+12.7 standard errors wide to each side."""
+
+
+def summary_line(variants: Sequence[Variant], protocol: Protocol) -> tuple[str, ...]:
+    """Return a sentence for each plain variant, then what limits them; nothing for one with too few pairs.
+
+    Controls are no way to get small and are left out. The mean of a variant decides, and its interval is stated: where
+    it reaches beyond the loss, a sentence says so.
+    """
+    found, wide, held = [], [], []
+    for plain in (variant for variant in variants if variant.sparsify == "none"):
+        compared = [
+            one
+            for one in _candidates(plain, variants, protocol)
+            if one.variant is not plain and not one.variant.control and one.gain.n >= MIN_PAIRS
+        ]
+        if not compared:
+            continue
+        smaller = [one for one in compared if one.gain.mean >= -LOSS and one.share < 100]
+        best = min(smaller, key=lambda one: one.share, default=None)
+        found.append(_sentence(plain, compared, best))
+        wide += [best.variant.name] if best and best.gain.low is not None and best.gain.low < -LOSS else []
+        held += [plain.name] if is_capped(plain) else []
+    if wide:
+        found.append(
+            f"Intervals that reach beyond {LOSS:g} dB: {', '.join(wide)}. More scenes or seeds may change this."
+        )
+    if held:
+        found.append(f"A limit ended the growth of {', '.join(held)}: shares of it are shares of that limit.")
+    return tuple(found)
+
+
+def _sentence(plain: Variant, compared: Sequence[_Candidate], best: _Candidate | None) -> str:
+    of = f"of {len(compared)} arms " if len(compared) > 1 else ""
+    if best is None:
+        nearest = max(compared, key=lambda one: one.gain.mean)
+        return f"{plain.name}: {of}none is smaller within {LOSS:g} dB; {nearest.variant.name} has {_numbers(nearest)}."
+    return f"{plain.name}: {of}the smallest within {LOSS:g} dB is {best.variant.name}, with {_numbers(best)}."
+
+
+def _numbers(one: _Candidate) -> str:
+    gain = one.gain
+    interval = "" if gain.low is None else f" [{gain.low:+.2f}, {gain.high:+.2f}]"
+    return f"{one.share:.0f} % of the Gaussians, {gain.mean:+.2f} dB{interval} of held-out PSNR, n = {gain.n}"

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sparsestreet.records.rig import RIG, RigRecord
+from sparsestreet.records.run import RIG, RigRecord
 from sparsestreet.records.strict_json import decoded_json
 from sparsestreet.scene.storage import scene_path
 from sparsestreet.scene.street_file import ATTACHED, SUFFIX, attached_file

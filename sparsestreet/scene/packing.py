@@ -10,7 +10,7 @@ from jaxtyping import Float64, Int16, Int64
 from torch import Tensor
 
 from sparsestreet.codec.gaussians import Block, Form, OtherColumn, Steps, packed_block
-from sparsestreet.codec.positions import curve_order, fits
+from sparsestreet.codec.vectors import curve_order, fits
 from sparsestreet.scene.nodes import Background, Node, Rigid, Smpl, Vibrating
 
 BLOCK = 65_536

@@ -20,11 +20,10 @@ import torch
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file
+from sparsestreet.codec.arrays import TYPES, Cursor, packed_column, unpacked_column
 from sparsestreet.codec.container import FrameReader, FrameWriter
 from sparsestreet.codec.gaussians import rows_in, unpacked_block
-from sparsestreet.codec.harmonics import packed_axes, principal_axes, unpacked_axes
-from sparsestreet.codec.plain import TYPES, packed_column, unpacked_column
-from sparsestreet.codec.reading import Cursor
+from sparsestreet.codec.vectors import packed_axes, principal_axes, unpacked_axes
 from sparsestreet.scene import packing
 from sparsestreet.scene.stored import ROWS, StoredScene, check_numbers, description, scene_of, without_masks
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 
 from sparsestreet.geometry.cameras import inverse
-from sparsestreet.records.rig import RigRecord
+from sparsestreet.records.run import RigRecord
 from sparsestreet.scene.edits.paths import between
 from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_of
 from sparsestreet.serving.cameras import Pose

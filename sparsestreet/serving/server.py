@@ -18,7 +18,7 @@ import grpc
 import sparsestreet
 from sparsestreet.demand import as_demand
 from sparsestreet.listening import address, check_address
-from sparsestreet.records.provenance import this_source
+from sparsestreet.records.run import this_source
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
 from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of

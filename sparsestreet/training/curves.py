@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sparsestreet.records.logged import LOGGED, Logged, LoggedFile
+from sparsestreet.records.curves import LOGGED, Logged, LoggedFile
 
 EARLIER = LoggedFile("curves/earlier.csv")
 """What a run logged before it went on, while it goes on: another kill must not lose it."""

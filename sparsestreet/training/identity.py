@@ -6,9 +6,7 @@ from dataclasses import dataclass, field
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.records.configuration import Setting, config_hash
-from sparsestreet.records.effects import EffectDecision
-from sparsestreet.records.provenance import this_machine, this_source
-from sparsestreet.records.run import RunDescription
+from sparsestreet.records.run import EffectDecision, RunDescription, this_machine, this_source
 from sparsestreet.training.recipe import Recipe
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from lightning import Callback
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.records.effects import EffectDecision
+from sparsestreet.records.run import EffectDecision
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.effects import EffectPlan, EffectSettings, plan_effects
 from sparsestreet.scene.initialize.training_data import TrainingData

@@ -21,8 +21,8 @@ from sparsestreet.data.ego import check_used
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene, help_to_evaluate
 from sparsestreet.phases import StageRecorder, stage
-from sparsestreet.pictures.effects import draw_effects
-from sparsestreet.pictures.history import draw_history
+from sparsestreet.pictures.plots import draw_history
+from sparsestreet.pictures.sheets import draw_effects
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.file import check_links
 from sparsestreet.records.run import RUN

@@ -2,10 +2,12 @@
 
 import contextlib
 import io
+import math
 import threading
 import time
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +15,106 @@ from sparsestreet.atomic import atomic_file
 from sparsestreet.export.page import look_from, private_server
 from sparsestreet.listening import Callers, bare, check_address
 from sparsestreet.types import View
-from sparsestreet.viewing.canvas import Canvas, Shot
-from sparsestreet.viewing.object_panel import ObjectPanel
-from sparsestreet.viewing.pace import Pace
-from sparsestreet.viewing.poses import eye_of, show_from
+from sparsestreet.viewing.object_panel import ObjectPanel, eye_of, show_from
 from sparsestreet.viewing.stage import Eye, Stage
+
+_MIN_PIXELS, _MAX_PIXELS = 40_000.0, 1920.0 * 1080
+"""Pixels of a picture while the camera moves. Below, a frame is no faster: all Gaussians are placed in any case."""
+_QUICKEST = 2.0
+"""Largest factor of a change between two frames; the square root of it is taken, since one frame is a noisy measure."""
+
+
+class Pace:
+    """Pixels of a frame, followed from how long frames take.
+
+    >>> pace = Pace(frames_per_second=10.0)
+    >>> for _ in range(30):
+    ...     pace.note(seconds=pace.pixels / 5e6)  # a machine of 5 million pixels a second
+    >>> round(pace.pixels / 1e5)
+    5
+    """
+
+    def __init__(self, frames_per_second: float) -> None:
+        self.budget = 1 / frames_per_second
+        self.pixels = 200_000.0
+
+    def note(self, seconds: float) -> None:
+        """A frame of ``pixels`` took so long."""
+        factor = min(max(self.budget / max(seconds, 1e-6), 1 / _QUICKEST), _QUICKEST)
+        self.pixels = min(max(self.pixels * math.sqrt(factor), _MIN_PIXELS), _MAX_PIXELS)
+
+    def size(self, width: int, height: int) -> tuple[int, int]:
+        """Width and height of a frame of a window, in its proportions and no larger.
+
+        >>> Pace(frames_per_second=10.0).size(1600, 800)
+        (632, 316)
+        """
+        return fitted(width, height, self.pixels)
+
+
+def fitted(width: int, height: int, pixels: float) -> tuple[int, int]:
+    """Returns a size in the same proportions with at most so many pixels.
+
+    >>> fitted(200, 100, 1e6), fitted(200, 100, 5000.0)
+    ((200, 100), (100, 50))
+    """
+    scale = min(1.0, math.sqrt(pixels / (width * height)))
+    return max(int(width * scale), 1), max(int(height * scale), 1)
+
+
+REST = 0.2
+"""Seconds without a change after which nothing moves."""
+MAX_STILL = 1920.0 * 1200
+"""Pixels of a picture at rest."""
+_SHORTEST = 1 / 30
+"""Seconds from one picture to the next: browsers show no more."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture that is due."""
+
+    eye: Eye
+    width: int
+    height: int
+    whole: bool
+    """Of full size: nothing moves."""
+
+
+class Canvas:
+    """One window. All times are seconds of one clock."""
+
+    def __init__(self, pace: Pace) -> None:
+        self.pace = pace
+        self.eye: Eye | None = None
+        self._version = -1
+        self._changed = self._drawn = float("-inf")
+        self._stale, self._whole = False, False
+
+    def look(self, eye: Eye, now: float) -> None:
+        """The window's camera or size has changed."""
+        self.eye, self._changed, self._stale = eye, now, True
+
+    def due(self, version: int, now: float) -> Shot | None:
+        """What to draw now, if anything; ``version`` is that of the stage."""
+        if self.eye is None:
+            return None
+        if version != self._version:
+            self._version, self._changed, self._stale = version, now, True
+        width, height = self.eye.width, self.eye.height
+        if self._stale and now - self._drawn >= _SHORTEST:
+            return Shot(self.eye, *self.pace.size(width, height), whole=False)
+        if not self._stale and not self._whole and now - self._changed >= REST:
+            return Shot(self.eye, *fitted(width, height, MAX_STILL), whole=True)
+        return None
+
+    def drawn(self, shot: Shot, seconds: float, now: float) -> None:
+        """The picture was drawn in so many seconds."""
+        if not shot.whole:
+            self.pace.note(seconds)
+        # The camera may have moved meanwhile.
+        self._drawn, self._stale, self._whole = now, self.eye is not shot.eye, shot.whole
+
 
 _QUALITY = {False: 50, True: 85}
 """Of a JPEG while something moves, and at rest."""

@@ -2,7 +2,7 @@
 
 from benchmarks import effect_recall
 from sparsestreet.bench.records import RecordFile, read_records
-from sparsestreet.records.effects import EffectDecision
+from sparsestreet.records.run import EffectDecision
 from tests.bench.test_records import PROVENANCE
 
 

@@ -13,7 +13,7 @@ from sparsestreet.cli.commands import bench as cli_bench
 from sparsestreet.cli.commands.bench import bench, trained_street
 from sparsestreet.cli.runs import run as cli_step
 from sparsestreet.ops import splat
-from sparsestreet.records.provenance import this_machine, this_source
+from sparsestreet.records.run import this_machine, this_source
 from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views

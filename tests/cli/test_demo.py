@@ -13,8 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from sparsestreet.cli.commands import demo as module
 from sparsestreet.cli.commands.demo import demo
 from sparsestreet.pictures.images import KINDS, picture_path, write_png
-from sparsestreet.records.quality import HELD_OUT, QUALITY
-from sparsestreet.records.summary import SUMMARY
+from sparsestreet.records.summary import HELD_OUT, QUALITY, SUMMARY
 from sparsestreet.scene.centers import node_legend
 from tests.evaluation.frames import disturbed, make_image, make_summary
 

@@ -17,10 +17,9 @@ from PIL import Image
 from sparsestreet.cli.commands import scenes
 from sparsestreet.cli.commands.render import USAGE, RenderRequest, render
 from sparsestreet.cli.config.compose import load_run_config
-from sparsestreet.export import rig, video
-from sparsestreet.export.layers import LAYERS, layer_values
-from sparsestreet.export.path import recorded, resized, shifted
-from sparsestreet.export.seen import count_images
+from sparsestreet.export import video
+from sparsestreet.export.layers import LAYERS, count_images, layer_values
+from sparsestreet.export.path import cropped, pinholes, raised, recorded, resized, shifted
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.edits import REMOVED, Edits, edited
@@ -304,7 +303,7 @@ def test_another_rig(run, tmp_path):
     assert render([f"{run}", f"{tmp_path / 'a'}", *words]) == 0
     (shown,) = pictures(tmp_path / "a")
     path = recorded(street_views(cameras=(0,)))[:1]
-    expected = rig.pinholes(rig.cropped(resized(rig.raised(path, 1.0), 60), 30), 100.0)[0][0]
+    expected = pinholes(cropped(resized(raised(path, 1.0), 60), 30), 100.0)[0][0]
     assert np.array_equal(shown, rendered(stored_street(), expected))
 
 

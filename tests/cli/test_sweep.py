@@ -25,9 +25,9 @@ from sparsestreet.cli.runs.sweep import (
     with_fixed_keys,
 )
 from sparsestreet.records.costs import update_costs
-from sparsestreet.records.failures import read_failures
+from sparsestreet.records.run import read_failures
 from sparsestreet.records.summary import SUMMARY
-from sparsestreet.report.published import TABLES
+from sparsestreet.report.paper import TABLES
 from tests.cli import configurations
 from tests.cli.conftest import TIMED_ONCE
 from tests.conftest import unchecked

@@ -19,10 +19,8 @@ from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.definitions import PROTOCOLS
 from sparsestreet.metrics.lpips import ALEX, FOLDER_VARIABLE
 from sparsestreet.records.costs import COSTS
-from sparsestreet.records.novel import NOVEL
-from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.run import RUN
-from sparsestreet.records.summary import SUMMARY
+from sparsestreet.records.summary import NOVEL, PRESETS, SUMMARY
 from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import read_views
 from tests.cli.conftest import TIMED_BY_DEFAULT

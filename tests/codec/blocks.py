@@ -3,7 +3,7 @@
 import numpy as np
 
 from sparsestreet.codec.gaussians import Block, Form, OtherColumn
-from sparsestreet.codec.harmonics import principal_axes
+from sparsestreet.codec.vectors import principal_axes
 
 OTHERS = {
     "instances": OtherColumn("int64", ()),

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sparsestreet.codec import harmonics, integers, positions
-from sparsestreet.codec.plain import TYPES, packed_column, unpacked_column
-from sparsestreet.codec.reading import Cursor
+from sparsestreet.codec import arrays as integers
+from sparsestreet.codec import vectors
+from sparsestreet.codec.arrays import TYPES, Cursor, packed_column, unpacked_column
 
 SIZES = st.sampled_from([0, 1, 2, 7, 255, 256, 257])
 
@@ -47,27 +47,27 @@ def test_neighbors_that_are_alike_cost_less():
 @given(SIZES, st.sampled_from([1e-3, 0.1, 3.0]), st.integers(0, 5))
 def test_points_come_back_within_half_a_step(rows: int, step: float, seed: int):
     points = np.random.default_rng(seed).uniform(-50, 80, (rows, 3))
-    order, pieces = positions.packed_points(points, step)
+    order, pieces = vectors.packed_points(points, step)
     assert np.array_equal(np.sort(order), np.arange(rows))
-    found = positions.unpacked_points(Cursor(b"".join(pieces)), rows)
+    found = vectors.unpacked_points(Cursor(b"".join(pieces)), rows)
     assert np.abs(found - points[order]).max(initial=0) <= step / 2 + 1e-12
-    assert np.array_equal(np.sort(positions.curve_order(points)), np.arange(rows))
+    assert np.array_equal(np.sort(vectors.curve_order(points)), np.arange(rows))
 
 
 def test_the_largest_grid_that_fits_and_the_first_that_does_not():
     corners = np.array([[0.0, 0, 0], [2.0**21 - 1.5, 5, 7]])
-    assert positions.fits(corners, 1.0)
-    order, pieces = positions.packed_points(corners, 1.0)
-    found = positions.unpacked_points(Cursor(b"".join(pieces)), 2)
+    assert vectors.fits(corners, 1.0)
+    order, pieces = vectors.packed_points(corners, 1.0)
+    found = vectors.unpacked_points(Cursor(b"".join(pieces)), 2)
     assert np.abs(found - corners[order]).max() <= 0.5
-    assert not positions.fits(corners * 1.01, 1.0)
-    assert positions.fits(corners[:0], 1e-9)
+    assert not vectors.fits(corners * 1.01, 1.0)
+    assert vectors.fits(corners[:0], 1e-9)
 
 
 def test_the_order_of_rows_pays_for_itself():
     """The floor of n points in a box without an order: log2(n!) / n bits less (Stirling: log2 n - 1.44)."""
     points, step = np.random.default_rng(0).uniform(0, 100, (20_000, 3)), 0.01
-    _, pieces = positions.packed_points(points, step)
+    _, pieces = vectors.packed_points(points, step)
     packed = sum(len(zstandard.compress(piece, 19)) for piece in pieces) / len(points)
     floor = (3 * np.log2(100 / step) - np.log2(len(points)) + 1.44) / 8
     assert floor < packed < floor + 0.3  # zstd codes whole bytes
@@ -106,9 +106,9 @@ def test_harmonics_come_back_and_the_first_axes_hold_the_energy():
     random = np.random.default_rng(0)
     # What real harmonics are like: three colors that vary together, and little else.
     values = np.repeat(random.normal(0, 1, (500, 4)), 3, axis=1) + 0.05 * random.normal(0, 1, (500, 12))
-    axes = harmonics.principal_axes(values.T @ values)
-    along = harmonics.along_axes(values, axes)
-    np.testing.assert_allclose(harmonics.from_axes(along, axes), values, atol=1e-9)
+    axes = vectors.principal_axes(values.T @ values)
+    along = vectors.along_axes(values, axes)
+    np.testing.assert_allclose(vectors.from_axes(along, axes), values, atol=1e-9)
     energy = (along**2).mean(0)
     assert energy[:4].sum() > 0.99 * energy.sum()
-    assert np.array_equal(harmonics.unpacked_axes(Cursor(harmonics.packed_axes(axes)), 12), axes)
+    assert np.array_equal(vectors.unpacked_axes(Cursor(vectors.packed_axes(axes)), 12), axes)

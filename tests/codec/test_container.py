@@ -9,8 +9,8 @@ import zlib
 import pytest
 import zstandard
 
-from sparsestreet.codec import limits
-from sparsestreet.codec.container import LARGEST, MAGIC, VERSION, FrameReader, FrameWriter
+from sparsestreet.codec import container
+from sparsestreet.codec.container import MAGIC, MAX_FRAME, VERSION, FrameReader, FrameWriter
 
 CONTENTS = [b"", b"a", bytes(range(256)) * 40]
 
@@ -85,9 +85,9 @@ BOMB = zstandard.compress(bytes(2**28), 3)
 HOSTILE = {
     "claims 4 GB": frame(b"DATA", zstandard.compress(b"a"), 2**32 - 1),
     "stores 4 GB": frame(b"DATA", b"abc", 1, claimed=2**32 - 1),
-    "stores more than there is": frame(b"DATA", b"abc", 1, claimed=LARGEST),
+    "stores more than there is": frame(b"DATA", b"abc", 1, claimed=MAX_FRAME),
     "unpacks to more than it claims": frame(b"DATA", BOMB, 100),
-    "unpacks to less than it claims": frame(b"DATA", zstandard.compress(b"a"), LARGEST),
+    "unpacks to less than it claims": frame(b"DATA", zstandard.compress(b"a"), MAX_FRAME),
     "is no zstd": frame(b"DATA", b"abcdefgh", 8),
     "wants a window of 2 GB": frame(b"DATA", bytes.fromhex("28b52ffd00a8010000"), 8),
 }
@@ -99,13 +99,13 @@ def test_absurd_sizes_are_refused_with_little_memory(content: bytes):
     try:
         with pytest.raises(ValueError, match=r"^\w[^\n]*$"):
             read(file_of(content))
-        assert tracemalloc.get_traced_memory()[1] < LARGEST + 2**20
+        assert tracemalloc.get_traced_memory()[1] < MAX_FRAME + 2**20
     finally:
         tracemalloc.stop()
 
 
 def test_many_small_frames_that_unpack_to_much_are_refused(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(limits, "FREE", 2**20)
+    monkeypatch.setattr(container, "FREE", 2**20)
     zeros = zstandard.compress(bytes(2**19))
     reader = FrameReader(io.BytesIO(file_of(*[frame(b"DATA", zeros, 2**19)] * 9)))
     with pytest.raises(ValueError, match=r"the file has \d+ bytes and claims \d+ unpacked, above its limit of"):
@@ -115,8 +115,8 @@ def test_many_small_frames_that_unpack_to_much_are_refused(monkeypatch: pytest.M
 
 def test_a_frame_that_no_reader_would_take_is_not_written():
     frames = FrameWriter(io.BytesIO())
-    with pytest.raises(ValueError, match=f"a frame holds at most {LARGEST} bytes, got {LARGEST + 1}"):
-        frames.write("DATA", [bytes(LARGEST), b"x"])
+    with pytest.raises(ValueError, match=f"a frame holds at most {MAX_FRAME} bytes, got {MAX_FRAME + 1}"):
+        frames.write("DATA", [bytes(MAX_FRAME), b"x"])
 
 
 def test_without_zstandard(monkeypatch: pytest.MonkeyPatch):

@@ -6,10 +6,22 @@ from typing import Any
 import torch
 
 from sparsestreet.records.configuration import Setting, config_hash
-from sparsestreet.records.latency import FRAME, RASTER, RIG, Latency, Percentiles
-from sparsestreet.records.quality import HELD_OUT, TRAINING, FrameQuality, MetricSummary, RegionQuality
 from sparsestreet.records.run import CodeVersion, Machine, Noise, RunDescription
-from sparsestreet.records.summary import Evaluation, GuardCounts, RunSummary
+from sparsestreet.records.summary import (
+    FRAME,
+    HELD_OUT,
+    RASTER,
+    RIG,
+    TRAINING,
+    Evaluation,
+    FrameQuality,
+    GuardCounts,
+    Latency,
+    MetricSummary,
+    Percentiles,
+    RegionQuality,
+    RunSummary,
+)
 from sparsestreet.types import Camera, Frame
 
 

@@ -15,7 +15,7 @@ from sparsestreet.evaluation.evaluate import Predictions, evaluate_frames
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips import ALEX, Lpips, lpips_of_layers, masked_lpips_of_layers
 from sparsestreet.ops import SplatSettings
-from sparsestreet.records.quality import RegionQuality, camera_means, summarize
+from sparsestreet.records.summary import RegionQuality, camera_means, summarize
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame, make_image
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene

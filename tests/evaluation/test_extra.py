@@ -12,8 +12,7 @@ from sparsestreet.evaluation import extra
 from sparsestreet.evaluation.extra import ExtraMetrics, _of_presets, _of_shifts
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import StageRecorder
-from sparsestreet.records.novel import NOVEL, NovelRecord, NovelShift
-from sparsestreet.records.presets import PRESETS, PresetRecord, RenderedAs
+from sparsestreet.records.summary import NOVEL, PRESETS, NovelRecord, NovelShift, PresetRecord, RenderedAs
 from sparsestreet.scene.rendering import RenderOptions
 from tests.evaluation.frames import NOISE, make_frame
 from tests.evaluation.scenes import OPTIONS, small_scene

@@ -12,7 +12,7 @@ from sparsestreet.evaluation.evaluate import screen_image
 from sparsestreet.evaluation.extra import evaluate_novel, shifted_views
 from sparsestreet.metrics.distances import frechet_distance, kernel_distance
 from sparsestreet.metrics.lpips import Lpips
-from sparsestreet.records.novel import NOVEL
+from sparsestreet.records.summary import NOVEL
 from sparsestreet.types import Frame
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene

@@ -12,8 +12,8 @@ from sparsestreet.evaluation import extra as presets_module
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.evaluation.extra import ROUNDS, evaluate_presets
 from sparsestreet.ops import SplatSettings
-from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.strict_json import RecordError
+from sparsestreet.records.summary import PRESETS
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame

@@ -18,10 +18,8 @@ from sparsestreet.metrics.lpips import ALEX, FOLDER_VARIABLE
 from sparsestreet.ops import Guards, SplatSettings
 from sparsestreet.pictures.images import picture_path
 from sparsestreet.records.costs import COSTS, NodeCost
-from sparsestreet.records.latency import LATENCY, clock_rows
-from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, summarize
 from sparsestreet.records.run import RUN
-from sparsestreet.records.summary import SUMMARY
+from sparsestreet.records.summary import HELD_OUT, LATENCY, QUALITY, SUMMARY, TRAINING, clock_rows, summarize
 from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import View

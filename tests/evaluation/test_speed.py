@@ -12,7 +12,7 @@ from sparsestreet import ops
 from sparsestreet.evaluation import speed
 from sparsestreet.evaluation.speed import frame_image, instants, measure_latency
 from sparsestreet.noise import Calibration
-from sparsestreet.records.latency import FRAME, LATENCY, RASTER, RIG, clock_rows
+from sparsestreet.records.summary import FRAME, LATENCY, RASTER, RIG, clock_rows
 from sparsestreet.scene import rendering
 from sparsestreet.scene.graph import SceneGraph
 from tests.evaluation.frames import make_frame, make_latency

@@ -6,7 +6,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.export.path import left_to_right, of_cameras, of_frames, recorded, resampled, resized, shifted
+from sparsestreet.export.path import (
+    cropped,
+    left_to_right,
+    of_cameras,
+    of_frames,
+    pinholes,
+    raised,
+    recorded,
+    resampled,
+    resized,
+    shifted,
+)
 from sparsestreet.geometry.cameras import project
 from sparsestreet.geometry.trajectories import frame_periods
 from tests.export.street import NUM_FRAMES, street_views
@@ -100,28 +111,6 @@ def test_a_lane_is_changed_smoothly():
     assert shifted(path[:1], 3.0, gradually=True)[0][0].camera.position.equal(path[0][0].camera.position)
 
 
-def test_a_path_at_its_own_rate_is_itself():
-    path = recorded(street_views())
-    assert resampled(path, STEP) == path
-
-
-def test_between_two_instants_lies_the_middle():
-    path = recorded(street_views())
-    finer = resampled(path, STEP / 2)
-    assert [rig[0].time for rig in finer] == [index / 8 for index in range(9)]
-    assert finer[::2] == path
-    for before, view, after in zip(path[1], finer[3], path[2], strict=True):
-        assert (view.frame_index, view.camera_index) == (None, before.camera_index)
-        middle = (before.camera.position + after.camera.position) / 2
-        torch.testing.assert_close(view.camera.position, middle, rtol=0, atol=2e-6)
-        # Half of 3 degrees, about the axis that the whole turn is about.
-        forward = view.camera.camera_from_world[2, :3]
-        for end in (before, after):
-            cosine = float(forward @ end.camera.camera_from_world[2, :3])
-            assert math.degrees(math.acos(min(cosine, 1.0))) == pytest.approx(1.5, abs=0.02)  # float32 near cos = 1
-        assert torch.equal(view.camera.intrinsics, before.camera.intrinsics)
-
-
 def test_a_quarter_of_the_way_lies_nearer_to_where_it_begins():
     """1 m and 3 degrees a frame, the same step everywhere."""
     finer = resampled(recorded(street_views()), STEP / 4)
@@ -193,3 +182,37 @@ def test_at_the_logs_own_rate_the_recorded_instants_are_shown():
     between = resampled(path, 0.5 / frame_periods(late))
     assert len(between) == 2 * NUM_FRAMES - 1
     assert [view.time for view in between[1]] == pytest.approx([(0.5 + 0.2 * camera) / 4.6 for camera in range(4)])
+
+
+PATH = recorded(street_views())
+POINT = torch.tensor([[9.0, 0.5, 1.0]])
+
+
+def test_a_raised_rig_sees_from_above():
+    for before, after in zip(PATH[2], raised(PATH, 1.25)[2], strict=True):
+        offset = after.camera.position - before.camera.position
+        torch.testing.assert_close(offset, torch.tensor([0.0, 0.0, 1.25]), rtol=0, atol=2e-6)
+        assert torch.equal(after.camera.camera_from_world[:3, :3], before.camera.camera_from_world[:3, :3])
+        assert (after.frame_index, after.camera_index, after.time) == (None, before.camera_index, before.time)
+
+
+@pytest.mark.parametrize("height", [20, 31, 48])
+def test_rows_come_and_go_above_and_below(height):
+    before, after = PATH[1][0].camera, cropped(PATH, height)[1][0].camera
+    assert (after.width, after.height) == (before.width, height)
+    (old, _, _), (new, _, _) = project(before, POINT), project(after, POINT)
+    # The same distance from the middle row.
+    torch.testing.assert_close(new[0, 1] - height / 2, old[0, 1] - before.height / 2)
+    assert new[0, 0] == old[0, 0]
+
+
+def test_a_pinhole_sees_as_far_as_its_field_of_view():
+    camera = pinholes(resized(PATH, 60), 100.0)[0][0].camera
+    assert (camera.width, camera.height, camera.distortion) == (60, 40, None)
+    # Camera 0 looks along +x from (0, 0, 1.5); 50 degrees to the left and to the right are the edges.
+    for side, edge in ((1, 0.0), (-1, 60.0)):
+        there = torch.tensor([[10.0, side * 10.0 * math.tan(math.radians(50)), 1.5]])
+        pixels, _, _ = project(camera, there)
+        torch.testing.assert_close(pixels[0], torch.tensor([edge, 20.0]), rtol=0, atol=1e-4)
+    with pytest.raises(ValueError, match="more than 0 and less than 180 degrees"):
+        pinholes(PATH, 180.0)

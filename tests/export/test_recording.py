@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from sparsestreet.export.frame import dome_around
 from sparsestreet.export.path import recorded
 from sparsestreet.export.recording import Cloud, Part, recorded_parts
-from sparsestreet.export.sky_dome import dome_around
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.ops import splat
 from sparsestreet.scene.edits import REMOVED, Change, Edits, Moved, edited

@@ -1,12 +1,20 @@
 """Sheets: what is where, and what is written on them."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from sparsestreet.pictures import sheets
 from sparsestreet.pictures.images import LIDAR_END, Picture
-from sparsestreet.pictures.sheets import SheetColumn, comparison_sheet, picture_sheet
+from sparsestreet.pictures.sheets import SheetColumn, comparison_sheet, draw_effects, picture_sheet
+from sparsestreet.records.costs import EffectGain, update_costs
+from sparsestreet.records.run import RUN
+from tests.evaluation.frames import make_summary
 from tests.evaluation.tiles import COLORS, flat, make_picture
+from tests.report.test_costs import LENS
 
 LEGEND = {"rigid": (250, 150, 40)}
 
@@ -113,3 +121,28 @@ def test_only_runs_of_the_same_images_are_compared():
         comparison_sheet([same, column("plain", COLORS["render"], frame=4)], title="t")
     with pytest.raises(ValueError, match="at least two runs, got 1"):
         comparison_sheet([same], title="t")
+
+
+def height(run: Path) -> int:
+    with Image.open(run / "pictures" / "effects.png") as image:
+        return image.height
+
+
+def test_a_row_for_each_effect(tmp_path):
+    run = replace(make_summary("m").run, effects=(LENS,))
+    RUN.write(tmp_path, run)
+    draw_effects(tmp_path)
+    assert not (tmp_path / "pictures").exists()  # nothing was measured
+    update_costs(tmp_path, effects={"lens": 0.5}, gains={"lens": EffectGain(2.0, None, None, 4)})
+    draw_effects(tmp_path)
+    one = height(tmp_path)
+    RUN.write(tmp_path, replace(run, effects=(LENS, replace(LENS, name="sky", on=False))))
+    draw_effects(tmp_path)
+    assert height(tmp_path) > one
+
+
+def test_a_run_without_a_plan_gets_none(tmp_path):
+    RUN.write(tmp_path, make_summary("m").run)
+    update_costs(tmp_path, effects={"sky": 0.5})
+    draw_effects(tmp_path)
+    assert not (tmp_path / "pictures").exists()

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sparsestreet.records.novel import NOVEL, NovelRecord, NovelShift
+from sparsestreet.records.summary import NOVEL, NovelRecord, NovelShift
 
 
 def write_beside(run: Path, distances: dict[float, float], name: str = "fid", psnr: float | None = None) -> None:

@@ -4,14 +4,42 @@ import csv
 import dataclasses
 import json
 import os
+from dataclasses import astuple
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING, FrameQuality, MetricSummary, RegionQuality
-from sparsestreet.records.run import RUN
+from sparsestreet.metrics.definitions import DEFINITIONS
+from sparsestreet.records.costs import COSTS, STEP_PHASES, CostRecord, StepPhase
+from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, LOGGED, CountChange, HeldOutLook
+from sparsestreet.records.file import JsonFile
+from sparsestreet.records.run import FAILURE, RUN, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError, significant, write_atomically
-from sparsestreet.records.summary import SUMMARY, GuardCounts
-from tests.evaluation.frames import make_image, make_run, make_summary
+from sparsestreet.records.summary import (
+    HELD_OUT,
+    LATENCY,
+    NOVEL,
+    PRESETS,
+    QUALITY,
+    SUMMARY,
+    TRAINING,
+    ClockRow,
+    FrameQuality,
+    GuardCounts,
+    Latency,
+    MetricSummary,
+    NovelRecord,
+    NovelShift,
+    Percentiles,
+    PresetRecord,
+    RegionQuality,
+    RenderedAs,
+    camera_means,
+    clock_rows,
+    summarize,
+)
+from tests.evaluation.frames import NOISE, make_image, make_run, make_summary
 
 IMAGES = [
     FrameQuality(0, 1, 12, 9, {"full": RegionQuality(108, 0.00123456, 29.0849, 0.912345)}),
@@ -29,6 +57,11 @@ IMAGES = [
         },
     ),
 ]
+
+
+SHIFT = NovelShift(offset=-1.5, views=6, distances={"fid": 42.5}, truth={"psnr_human": 20.5}, true_views=5)
+NEXT_TO_IT = NovelRecord(command="n", ramp=True, real_views=7, absent="no weights", shifts=(SHIFT,))
+NO_COSTS = CostRecord(phases={}, step_ms={}, passes={}, frame_ms={}, nodes={}, effects={})
 
 
 def test_summary_round_trip(tmp_path):
@@ -88,8 +121,10 @@ def test_a_record_of_no_view_or_of_an_unknown_split_is_refused():
     [
         (RUN, make_run(), "format 0, this version reads 2: train the run again"),
         (SUMMARY, make_summary(), "format 0, this version reads 4: evaluate again"),
+        (NOVEL, NEXT_TO_IT, "format 0, this version reads 2: evaluate again with novel"),
+        (COSTS, NO_COSTS, "format 0, this version reads 1: train the run again"),
     ],
-    ids=["run", "summary"],
+    ids=["run", "summary", "novel", "cost"],
 )
 def test_another_format_is_named_before_its_keys(tmp_path, file, value, remedy):
     path = file.path(tmp_path)
@@ -248,3 +283,146 @@ def test_a_crash_while_writing_leaves_the_old_file_alone(tmp_path, monkeypatch):
         write_atomically(path, "new")
     assert [entry.name for entry in tmp_path.iterdir()] == ["summary.json"]
     assert path.read_text() == "old"
+
+
+TABLES = [
+    (
+        HELD_OUT_CURVE,
+        "curves/held_out.csv",
+        [HeldOutLook(1.5, 10, 20.25, None, 22.75), HeldOutLook(12.125, 25, None, 21.5, None)],
+        "seconds,step,psnr_full,psnr_human,psnr_vehicle\n1.500,10,20.2500,,22.7500\n12.125,25,,21.5000,\n",
+    ),
+    (
+        STEP_PHASES,
+        "records/phases.csv",
+        [StepPhase(47, "splat", 1.25), StepPhase(94, "loss sky", 0.0625)],
+        "step,phase,milliseconds\n47,splat,1.2500\n94,loss sky,0.0625\n",
+    ),
+    (
+        LEDGER,
+        "records/counts.csv",
+        [CountChange(3, "rigid", 20, 15, "mask"), CountChange(7, "background", 100, 130, "densify")],
+        "step,node,before,after,reason\n3,rigid,20,15,mask\n7,background,100,130,densify\n",
+    ),
+    (
+        LATENCY,
+        "records/latency.csv",
+        [
+            ClockRow("frame", "masked", Percentiles(1.5, 2.5, 3.5, 7)),
+            ClockRow("rig", "removed", Percentiles(4.0, 5.0, 6.0, 8)),
+        ],
+        "clock,rows,p50,p90,p99,repeats\nframe,masked,1.5,2.5,3.5,7\nrig,removed,4.0,5.0,6.0,8\n",
+    ),
+]
+
+
+@pytest.mark.parametrize(("file", "name", "rows", "text"), TABLES, ids=[name for _, name, _, _ in TABLES])
+def test_a_table_is_read_as_it_was_written(tmp_path, file, name, rows, text):
+    file.write(tmp_path, rows)
+    assert file.path(tmp_path) == tmp_path / name
+    assert (tmp_path / name).read_text() == text
+    assert file.read(tmp_path) == rows
+
+
+@pytest.mark.parametrize(("file", "name", "rows", "text"), TABLES, ids=[name for _, name, _, _ in TABLES])
+def test_a_cell_that_is_no_number_is_named(tmp_path, file, name, rows, text):
+    file.write(tmp_path, rows)
+    header, first = text.splitlines()[:2]
+    number = next(cell for cell in first.split(",") if cell.replace(".", "").isdigit())
+    (tmp_path / name).write_text(f"{header}\n{first.replace(number, 'soon', 1)}\n")
+    with pytest.raises(RecordError, match=r"line 2: .*soon.*; (train|evaluate) the run again"):
+        file.read(tmp_path)
+
+
+def test_clocks_are_of_all_gaussians_or_of_masked_and_removed_ones():
+    def clocks(first: float) -> dict[str, Percentiles]:
+        return {name: Percentiles(first + place, 8.0, 9.0, 3) for place, name in enumerate(("raster", "frame", "rig"))}
+
+    plain = Latency(clocks(1.0), {}, 20, 6, "d", 2, NOISE)
+    assert [(row.clock, row.gaussians, row.percentiles.p50) for row in clock_rows(plain)] == [
+        ("raster", "all", 1.0), ("frame", "all", 2.0), ("rig", "all", 3.0),
+    ]  # fmt: skip
+    masked = Latency(clocks(1.0), clocks(4.0), 20, 6, "d", 2, NOISE)
+    assert [(row.clock, row.gaussians, row.percentiles.p50) for row in clock_rows(masked)] == [
+        ("raster", "masked", 1.0), ("frame", "masked", 2.0), ("rig", "masked", 3.0),
+        ("raster", "removed", 4.0), ("frame", "removed", 5.0), ("rig", "removed", 6.0),
+    ]  # fmt: skip
+    assert masked.p50 == 2.0
+    assert masked.protocol.startswith("3 renders cycling through 6 views after 20 warm-up renders")
+    for broken in ({"raster": clocks(1.0)["raster"]}, clocks(1.0) | {"more": clocks(1.0)["rig"]}):
+        with pytest.raises(ValueError, match="a latency has the clocks raster, frame, rig, got"):
+            Latency(broken, {}, 20, 6, "d", 2, NOISE)
+        with pytest.raises(ValueError, match="of removed Gaussians"):
+            Latency(clocks(1.0), broken, 20, 6, "d", 2, NOISE)
+
+
+def check_written(run: Path, file: JsonFile[Any], name: str, record: Any) -> None:
+    file.write(run, record)
+    assert (run / name).is_file()
+    assert file.read(run) == record
+
+
+def test_records_beside_the_summary_are_read_as_they_were_written(tmp_path):
+    way = RenderedAs(
+        preset="fast", trained=True, quality={"psnr_full": 25.5}, psnr_to_exact=50.5, frame_ms=7.5, repeats=9
+    )
+    presets = PresetRecord(command="p", device="d", threads=3, views=4, noise=NOISE, rendered=(way,))
+    failed = FailedRun(label="a+b", seed=4, command="c", error="e", trace="t")
+    check_written(tmp_path / "run", NOVEL, "records/novel.json", NEXT_TO_IT)
+    check_written(tmp_path / "run", PRESETS, "records/presets.json", presets)
+    check_written(tmp_path / "run", FAILURE, "failed.json", failed)
+    assert read_failures(tmp_path) == [(tmp_path / "run", failed)]
+
+
+def test_a_truth_has_known_metrics_alone(tmp_path):
+    """The error names the place in the file."""
+    with pytest.raises(ValueError, match="truth holds psnr_near, psnr_sky, expected psnr_full, psnr_human, psnr_veh"):
+        dataclasses.replace(SHIFT, truth={"psnr_sky": 1.0, "psnr_near": 2.0})
+    NOVEL.write(tmp_path, NEXT_TO_IT)
+    path = NOVEL.path(tmp_path)
+    path.write_text(path.read_text().replace("psnr_human", "psnr_sky"))
+    with pytest.raises(RecordError, match=r"novel\.json: shifts\[0\]: truth holds psnr_sky, expected psnr_full, "):
+        NOVEL.read(tmp_path)
+
+
+def test_what_training_logged_keeps_every_column(tmp_path):
+    assert LOGGED.rows(tmp_path) == []
+    LOGGED.write(tmp_path, [{"step": "9", "psnr": "20"}, {"step": "19", "val/psnr": "18,5", "a\nb": ""}])
+    path = tmp_path / "curves" / "metrics.csv"
+    assert path.read_bytes() == b'step,psnr,val/psnr,"a\nb"\n9,20,,\n19,,"18,5",\n'
+    path.write_bytes(b'step,psnr\r\n9,"2\r\n0"\r\n')
+    assert LOGGED.rows(tmp_path) == [{"step": "9", "psnr": "2\r\n0"}]  # a line of a cell is no line of the table
+
+
+def image(frame: int, camera: int, first: float, **more: float | None) -> FrameQuality:
+    values = dict(zip(("mse", "psnr", "ssim_uniform7", "psnr8", "ssim_gauss11", "lpips_alex", "lpips_vgg"),
+                      (first + place for place in range(7)), strict=True))  # fmt: skip
+    full = RegionQuality(108, **(values | more))
+    return FrameQuality(frame, camera, 12, 9, {"full": full, "sky": full})
+
+
+def test_summaries_are_over_the_images_that_have_a_metric():
+    """Two of three have LPIPS; a PSNR of 100 dB and more counts as capped, an MSE does not."""
+    images = [image(0, 1, 99.0), image(1, 2, 100.0, lpips_alex=None), image(2, 1, 102.0, psnr8=None)]
+    found = summarize(images)
+    assert list(found) == list(DEFINITIONS)
+    sd = (7 / 3) ** 0.5
+    for name, expected in (
+        ("mse_full", (301 / 3, sd, 3, 0)),
+        ("psnr_full", (304 / 3, sd, 3, 3)),
+        ("psnr8_full", (102.5, 0.5**0.5, 2, 2)),
+        ("lpips_alex_full", (105.5, 4.5**0.5, 2, 0)),
+    ):
+        assert astuple(found[name]) == pytest.approx(expected), name
+    assert found["psnr_human"] == MetricSummary(None, None, 0, 0)
+    assert summarize(images[:1])["psnr_full"] == MetricSummary(100.0, None, 1, 1)
+    assert summarize([image(0, 0, 98.5)])["psnr_full"].capped == 0
+    assert (images[0].value("psnr", "full"), images[0].value("psnr", "human")) == (100.0, None)
+    assert (images[0].pixels("full"), images[0].pixels("human")) == (108, 0)
+
+
+def test_cameras_have_means_of_their_own():
+    found = camera_means([image(0, 10, 20.0), image(1, 2, 30.0), image(2, 10, 24.0)])
+    assert list(found) == ["2", "10"]
+    assert (found["2"]["psnr_full"], found["10"]["psnr_full"]) == (31.0, 23.0)
+    assert found["2"]["psnr_vehicle"] is None

@@ -6,11 +6,10 @@ import numpy as np
 
 from sparsestreet.pictures.images import KINDS, picture_path, write_png
 from sparsestreet.records.costs import NodeCost, update_costs
-from sparsestreet.records.failures import FAILURE, FailedRun
-from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.records.ledger import LEDGER, CountChange
+from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, CountChange, HeldOutLook
+from sparsestreet.records.run import FAILURE, FailedRun
 from sparsestreet.records.summary import SUMMARY, RunSummary
-from sparsestreet.report import RunRecord
+from sparsestreet.report.collect import RunRecord
 from tests.evaluation.frames import make_summary
 from tests.typed import there
 

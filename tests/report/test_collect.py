@@ -7,7 +7,7 @@ import pytest
 
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
-from sparsestreet.report import collect
+from sparsestreet.report.collect import collect
 from tests.evaluation.frames import make_summary
 
 

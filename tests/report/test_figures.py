@@ -13,20 +13,29 @@ from matplotlib.figure import Figure
 
 from sparsestreet.metrics.definitions import DRIVESTUDIO, STRICT
 from sparsestreet.records.costs import NodeCost, update_costs
-from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.records.ledger import LEDGER, PRUNING, CountChange
+from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, PRUNING, CountChange, HeldOutLook
 from sparsestreet.records.strict_json import RecordError
-from sparsestreet.report import collect, figures, figures_time
-from sparsestreet.report.arms import arms
-from sparsestreet.report.figures import COLORS, GREY, PARETO_COSTS, front, panels, pareto, short, styles, write_svg
-from sparsestreet.report.figures_time import (
+from sparsestreet.report import figures
+from sparsestreet.report.collect import collect
+from sparsestreet.report.figures import (
+    COLORS,
+    GREY,
+    PARETO_COSTS,
     _counts,
     _frame_costs,
+    _paint,
     counts_over_time,
     frame_waterfall,
+    front,
     held_out_over_time,
+    panels,
+    pareto,
+    styles,
+    time_figure,
+    write_svg,
 )
 from sparsestreet.report.sweep import _figures
+from sparsestreet.report.variants import variants
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, write_sweep
 
@@ -36,26 +45,9 @@ def test_the_front_is_what_nothing_beats():
     assert front(points) == [(1.0, 20.0), (2.0, 22.0), (4.0, 23.0)]
 
 
-def test_short_numbers():
-    assert [short(value) for value in (0.5, 200.0, 12_000.0, 1.5e6)] == ["0.5", "200", "12k", "1.5M"]
-
-
 @pytest.fixture
 def found(tmp_path):
-    return arms(collect([write_sweep(tmp_path / "sweep", failed=False)]))
-
-
-@pytest.mark.lengthy
-def test_pareto_draws_every_run_and_every_mean(found, tmp_path):
-    path = tmp_path / "pareto.svg"
-    assert pareto(found, DRIVESTUDIO, PARETO_COSTS[0], path)
-    text = path.read_text()
-    titles = [name for name in ("full image", "people", "vehicles") if f">{name}<" in text]
-    assert titles == ["full image", "vehicles"]  # no run measured people
-    # 3 runs and a mean, of a plain, a pruned and a grey arm, in 2 panels.
-    assert [len(re.findall(rf"<use [^>]*fill: {paint}", text, re.I)) for paint in (COLORS[0], COLORS[2])] == [8, 8]
-    assert len(re.findall(rf"<use [^>]*stroke: {GREY}", text)) >= 2 * 4
-    assert "control: random" in text
+    return variants(collect([write_sweep(tmp_path / "sweep", failed=False)]))
 
 
 UNEQUAL = {
@@ -68,7 +60,7 @@ UNEQUAL = {
 @pytest.mark.lengthy
 def test_an_arrow_is_of_the_seeds_that_both_arms_have(tmp_path, monkeypatch):
     """The mean of masks, 21.5, lies above that of the plain runs, 21, and they gain nothing: seed 0 is harder."""
-    found = arms(
+    found = variants(
         [record(make_summary(name, seed, psnr, {"background": n})) for (name, seed), (psnr, n) in UNEQUAL.items()]
     )
     arrows, fronts, hollow = [], [], []
@@ -103,20 +95,13 @@ def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     assert (tmp_path / "once" / "again" / "a.svg").read_text() == one
 
 
-@pytest.mark.lengthy
-def test_figures_over_time(found, tmp_path):
-    for draw, word in ((held_out_over_time, "training seconds"), (counts_over_time, "step"), (frame_waterfall, "sky")):
-        assert draw(found, tmp_path / "some.svg")
-        assert word in (tmp_path / "some.svg").read_text()
-
-
 def test_a_bar_is_the_mean_over_runs(tmp_path):
     runs = []
     for seed, ms in enumerate((1.0, 4.0)):
         update_costs(tmp_path / str(seed), nodes={"rigid": NodeCost(10, 0.1, 4.0, ms)}, effects={"sky": 2 * ms})
         runs.append(record(make_summary("plain", seed), str(tmp_path / str(seed))))
-    (arm,) = arms(runs)
-    assert _frame_costs(arm) == {"rigid": 2.5, "effect: sky": 5.0}
+    (variant,) = variants(runs)
+    assert _frame_costs(variant) == {"rigid": 2.5, "effect: sky": 5.0}
 
 
 def test_counts_are_of_all_nodes(tmp_path):
@@ -124,8 +109,8 @@ def test_counts_are_of_all_nodes(tmp_path):
     starts = [CountChange(0, name, 0, rows, "start") for name, rows in (("background", 100), ("rigid", 20))]
     LEDGER.write(tmp_path, [*starts, CountChange(5, "background", 100, 30, PRUNING)])
     axes = Figure().subplots()
-    (arm,) = arms([record(make_summary("plain"))])
-    _counts(axes, styles([arm])[arm.name], tmp_path)
+    (variant,) = variants([record(make_summary("plain"))])
+    _counts(axes, styles([variant])[variant.name], tmp_path)
     line, dots = ([np.asarray(values).tolist() for values in drawn.get_data()] for drawn in axes.get_lines())
     assert (line, dots) == ([[0, 5], [120, 50]], [[5], [50]])
 
@@ -145,16 +130,9 @@ def test_every_run_has_a_line(tmp_path, monkeypatch):
         HELD_OUT_CURVE.write(tmp_path / name, [HeldOutLook(10.0, 9, 20.0, None, None)])
         runs.append(record(make_summary("plain"), str(tmp_path / name)))
     drawn = []
-    monkeypatch.setattr(figures_time, "write_svg", lambda figure, path, says=None: drawn.append(figure))
-    assert held_out_over_time(arms(runs), tmp_path / "some.svg")
+    monkeypatch.setattr(figures, "write_svg", lambda figure, path, says=None: drawn.append(figure))
+    assert held_out_over_time(variants(runs), tmp_path / "some.svg")
     assert len(drawn[0].axes[0].get_lines()) == 2
-
-
-def test_what_was_not_recorded_is_not_drawn(tmp_path):
-    found = arms(collect([write_sweep(tmp_path / "sweep", curves=False)]))
-    for draw in (held_out_over_time, frame_waterfall):
-        assert not draw(found, tmp_path / "some.svg")
-    assert not (tmp_path / "some.svg").exists()
 
 
 def test_costs_of_another_format_are_named(found, tmp_path):
@@ -168,8 +146,7 @@ def test_costs_of_another_format_are_named(found, tmp_path):
 def canvas(monkeypatch):
     """The figures that would have been written, by the name of their file."""
     drawn = {}
-    for module in (figures, figures_time):
-        monkeypatch.setattr(module, "write_svg", lambda figure, path, says=None: drawn.update({path.name: figure}))
+    monkeypatch.setattr(figures, "write_svg", lambda figure, path, says=None: drawn.update({path.name: figure}))
     return drawn
 
 
@@ -183,7 +160,7 @@ def two_methods():
     for label, (psnr, rows, ms, seconds) in runs.items():
         numbers: dict[str, Any] = {"vehicle_psnr": psnr - 7, "milliseconds": ms, "training_seconds": seconds}
         found.append(record(make_summary(label, 0, psnr, {"x": rows}, **numbers), label))
-    return arms(found)
+    return variants(found)
 
 
 def points(collection):
@@ -206,7 +183,7 @@ def arrows(axes):
 )
 def test_a_panel_has_marks_arrows_and_the_front(canvas, tmp_path, cost, x):
     found = two_methods()
-    assert [arm.name for arm in found] == ["a", "a+paper", "a+random", "b", "b+removal"]
+    assert [variant.name for variant in found] == ["a", "a+paper", "a+random", "b", "b+removal"]
     assert pareto(found, DRIVESTUDIO, cost, tmp_path / "p.svg")
     full, vehicles = canvas["p.svg"].axes
     assert [axes.get_title() for axes in (full, vehicles)] == ["full image", "vehicles"]
@@ -246,28 +223,28 @@ def test_marks_in_the_legend_are_those_of_the_panel(canvas, tmp_path):
     assert list(handles) == ["a", "b", "plain", "paper", "control: random", "removal", "front of the means"]
     assert [handles[name].get_color() for name in ("a", "b", "control: random")] == [*COLORS[:2], GREY]
     assert [handles[name].get_marker() for name in list(handles)[2:6]] == ["o", "s", "x", "D"]
-    assert [styles(found)[arm.name].marker for arm in found] == ["o", "s", "x", "o", "D"]
+    assert [styles(found)[variant.name].marker for variant in found] == ["o", "s", "x", "o", "D"]
 
 
 def test_a_figure_of_one_region_or_none(canvas, tmp_path):
-    only = arms([record(make_summary("a", vehicle_psnr=None))])
+    only = variants([record(make_summary("a", vehicle_psnr=None))])
     assert pareto(only, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "p.svg")
     assert [axes.get_title() for axes in canvas["p.svg"].axes] == ["full image"]
     canvas.clear()
     assert not pareto(only, STRICT, PARETO_COSTS[0], tmp_path / "p.svg")
     assert not pareto(
-        arms([record(make_summary("a", training_seconds=None))]), DRIVESTUDIO, PARETO_COSTS[3], tmp_path / "p"
+        variants([record(make_summary("a", training_seconds=None))]), DRIVESTUDIO, PARETO_COSTS[3], tmp_path / "p"
     )
     assert canvas == {}
 
 
 def test_bars_of_a_frame_lie_behind_each_other(canvas, tmp_path):
-    """Each arm has a row, each part a color; an effect is hatched."""
+    """Each variant has a row, each part a color; an effect is hatched."""
     parts = {"a": (3.0, 1.0, 0.5), "a+paper": (1.5, 0.25, 0.75)}
     for name, (road, cars, sky) in parts.items():
         nodes = {node: NodeCost(10, 0.1, 4.0, ms) for node, ms in (("road", road), ("cars", cars))}
         update_costs(tmp_path / name, nodes=nodes, effects={"sky": sky})
-    found = arms([record(make_summary(name), str(tmp_path / name)) for name in parts])
+    found = variants([record(make_summary(name), str(tmp_path / name)) for name in parts])
     assert frame_waterfall(found, tmp_path / "w.svg")
     (axes,) = canvas["w.svg"].axes
     bars = [
@@ -299,7 +276,7 @@ def test_a_curve_is_the_runs_own(canvas, tmp_path):
         rows = 100 * (place + 1)
         LEDGER.write(folder, [CountChange(0, "x", 0, rows, "start"), CountChange(5, "x", rows, 50, PRUNING)])
         runs.append(record(make_summary(name), str(folder)))
-    found = arms(runs)
+    found = variants(runs)
     for draw, x_label, y_label, drawn in (
         (held_out_over_time, "training seconds", "held-out PSNR, dB",
          [([10.0 + place, 30.0 + place], [20.0 + place, 25.0 - place]) for place in range(4)]),
@@ -336,17 +313,6 @@ def test_figures_are_named_and_what_is_absent_is_said(tmp_path):
         assert svg == (tmp_path / f"pareto_{cost[0]}.svg").read_text()
 
 
-def test_panels_are_as_large_as_they_are_asked_to_be(canvas, tmp_path):
-    drawn = panels(1), panels(3), panels(2, 4.6, 4.0)
-    sizes = [figure.get_size_inches().tolist() for figure, _ in drawn]
-    assert sizes == [pytest.approx(size) for size in ((3.2, 3.4), (9.6, 3.4), (9.2, 4.0))]
-    assert [len(axes) for _, axes in drawn] == [1, 3, 2]
-    for name in ("a", "b"):
-        update_costs(tmp_path / name, nodes={"road": NodeCost(10, 0.1, 4.0, 3.0)})
-    frame_waterfall(arms([record(make_summary(name), str(tmp_path / name)) for name in "ab"]), tmp_path / "w.svg")
-    assert canvas["w.svg"].get_size_inches().tolist() == pytest.approx([7.4, 1.1 + 0.34 * 2])
-
-
 def test_marks_say_what_they_are(found, tmp_path):
     """Three streets: a run each, and a mean, in the order in which they are drawn; names of groups are not left."""
     assert pareto(found, DRIVESTUDIO, PARETO_COSTS[0], tmp_path / "a.svg")
@@ -356,7 +322,7 @@ def test_marks_say_what_they_are(found, tmp_path):
         f"streetgs, street {seed}, seed {seed}: {25 + seed}.000 dB, 10,000 Gaussians" for seed in range(3)
     ]
     assert said.count("streetgs, mean: 26.000 dB, 10,000 Gaussians") == 1
-    assert len(said) == 4 * 3 * 2  # three runs and a mean of three arms, in two panels
+    assert len(said) == 4 * 3 * 2  # three runs and a mean of three variants, in two panels
     assert ' runs"' not in text
     figure, (axes,) = panels(1)
     axes.scatter([1.0], [2.0], gid="one")
@@ -372,7 +338,7 @@ RULES = [
 
 
 def of_a_sweep(folder):
-    """Twelve arms of one method: four sparsifications with three rules each, told apart by a group alone."""
+    """Twelve variants of one method: four sparsifications with three rules each, told apart by a group alone."""
     for index, (sparsify, kind) in enumerate(RULES):
         run = folder / f"{index}"
         command = f"sparsestreet train sparsify={sparsify} pruning@callback.pruning.rule={kind}"
@@ -387,7 +353,7 @@ def of_a_sweep(folder):
 
 def test_every_arm_of_a_figure_has_a_look_of_its_own(tmp_path):
     """By color and marker in the scatter, by color and dash over time, with its own entry in the legend."""
-    found = arms(list(of_a_sweep(tmp_path)))
+    found = variants(list(of_a_sweep(tmp_path)))
     assert len(found) == len(RULES)
     drawn = styles(found).values()
     for look in (
@@ -403,7 +369,7 @@ def test_every_arm_of_a_figure_has_a_look_of_its_own(tmp_path):
         for method in "ab"
         for sparsify in ("paper", "paper_short", "mine", "other")
     ]
-    drawn = styles(arms([record(one) for one in pairs])).values()
+    drawn = styles(variants([record(one) for one in pairs])).values()
     assert len({(one.method, one.marker) for one in drawn}) == len(pairs)
 
 
@@ -421,9 +387,74 @@ def test_names_of_bars_do_not_run_into_each_other(tmp_path, canvas):
     ]
     for one in runs:
         update_costs(one.folder, nodes={"rigid": NodeCost(10, 0.1, 4.0, 1.0)})
-    frame_waterfall(arms(runs), tmp_path / "w.svg")
+    frame_waterfall(variants(runs), tmp_path / "w.svg")
     figure = canvas["w.svg"]
     FigureCanvasAgg(figure).draw()
     boxes = [text.get_window_extent() for text in figure.axes[0].get_yticklabels()]
-    assert len(boxes) == 3  # two of the runs are of one arm
+    assert len(boxes) == 3  # two of the runs are of one variant
     assert not any(one.overlaps(other) for index, one in enumerate(boxes) for other in boxes[:index])
+
+
+def test_without_held_out_views_there_is_none(tmp_path):
+    found = variants([record(make_summary(psnr=None, training_psnr=20.0, split="none"))])
+    with pytest.raises(ValueError, match="no run was evaluated on held-out views"):
+        time_figure(found, DRIVESTUDIO, tmp_path / "time.png")
+
+
+def test_arms_of_one_method_differ_in_color_and_those_of_several_by_method():
+    one = variants([record(make_summary(label)) for label in ("a", "a+paper")])
+    assert len({_paint(styles(one), variant) for variant in one}) == 2
+    several = [*one, *variants([record(make_summary("b"))])]
+    assert len({_paint(styles(several), variant) for variant in one}) == 1
+    assert len({_paint(styles(several), variant) for variant in several}) == 2
+
+
+def figure_of(runs, tmp_path, monkeypatch):
+    """The panels of training and of frames."""
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **how: drawn.append((self, path, how)))
+    time_figure(variants(runs), DRIVESTUDIO, tmp_path / "deep" / "time.png")
+    ((figure, path, how),) = drawn
+    assert path == tmp_path / "deep" / "time.png"
+    assert (how["dpi"], how["facecolor"]) == (150, "white")
+    return figure, *figure.axes
+
+
+def test_without_curves_runs_and_means_are_points(tmp_path, monkeypatch):
+    """Two seeds of one scene and one of another: 24 dB at 30 ms and 300 s, and 20 dB at 60 ms and 100 s."""
+    runs = [
+        record(make_summary("m", seed, psnr, scene=scene, milliseconds=ms, training_seconds=seconds))
+        for seed, psnr, scene, ms, seconds in
+        ((0, 23.0, "x", 20.0, 200.0), (1, 25.0, "x", 40.0, 400.0), (0, 20.0, "y", 60.0, 100.0))
+    ]  # fmt: skip
+    control = record(make_summary("m+random", 0, 1.0, milliseconds=1.0, scene="x"))
+    figure, training, frame = figure_of([*runs, control], tmp_path, monkeypatch)
+    assert (training.get_xlabel(), frame.get_xlabel()) == ("training seconds", "milliseconds a frame")
+    assert training.get_ylabel() == "held-out PSNR, dB"
+    for axes, costs, mean in ((training, (200.0, 400.0, 100.0), 200.0), (frame, (20.0, 40.0, 60.0), 45.0)):
+        single, whole = (one.get_offsets().tolist() for one in axes.collections)
+        assert sorted(single) == sorted(map(list, zip(costs, (23.0, 25.0, 20.0), strict=True)))
+        assert whole == [[mean, 22.0]]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["m"]
+
+
+def test_curves_are_means_with_a_mark_at_their_end(tmp_path, monkeypatch):
+    runs = []
+    for seed in (0, 1):
+        for label, less in (("m", 0.0), ("m+paper", 4.0)):
+            folder = tmp_path / f"{label}{seed}"
+            looks = [HeldOutLook(10.0 * at + 2 * seed, at, 20.0 + at + seed - less, 1.0, 2.0) for at in (1, 2, 3)]
+            HELD_OUT_CURVE.write(folder, looks)
+            runs.append(record(make_summary(label, seed), str(folder)))
+    _, training, frame = figure_of(runs, tmp_path, monkeypatch)
+    plain, paper = training.get_lines()
+    for line, less in ((plain, 0.0), (paper, 4.0)):
+        assert [np.asarray(part).tolist() for part in line.get_data()] == [
+            [11.0, 21.0, 31.0], [21.5 - less, 22.5 - less, 23.5 - less],
+        ]  # fmt: skip
+        assert line.get_markevery() == [2]
+    assert [(line.get_label(), line.get_linestyle(), line.get_marker()) for line in (plain, paper)] == [
+        ("m", "-", "o"), ("m+paper", "--", "s"),
+    ]  # fmt: skip
+    assert plain.get_color() != paper.get_color()
+    assert len(frame.collections) == 4

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.records.quality import HELD_OUT, MetricSummary
+from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.summary import HELD_OUT, MetricSummary
 from sparsestreet.report.result import result_lines
 from tests.evaluation.frames import disturbed, make_summary
 

@@ -1,11 +1,23 @@
 """Tables from hand-made records, against numbers worked out by hand."""
 
+import dataclasses
+import io
 from pathlib import Path
 
 import pytest
+from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
 
-from sparsestreet.report import RunRecord, Spread, markdown, sections, spread
-from tests.evaluation.frames import disturbed, make_summary
+from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
+from sparsestreet.records.run import CodeVersion
+from sparsestreet.records.summary import HELD_OUT, Evaluation, MetricSummary
+from sparsestreet.report.collect import RunRecord
+from sparsestreet.report.sections import section_tables, sections, sections_markdown, size_figure
+from sparsestreet.report.tables import Spread
+from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary
+from tests.report.sweep_folder import record
+from tests.typed import as_a
 
 
 def records(*summaries):
@@ -49,25 +61,6 @@ def test_rows_hold_mean_spread_and_number_of_runs():
     assert found["Gaussians"].mean == pytest.approx((400 / 1200 + 400 / 1600) / 2 * 100)  # per cent kept
     assert found["ms/frame"].mean == pytest.approx((50 + 75) / 2)
     assert [row.runs for row in section.rows] == ["n=2 (seed 0,1)"] * 3
-
-
-def test_two_runs_that_differ_in_one_option_stand_apart():
-    (section,) = sections(
-        records(
-            make_summary("streetgs+removal", psnr=30.0, config={"schedule.removal_db": 0.1}),
-            make_summary("streetgs+removal", psnr=31.0, config={"schedule.removal_db": 0.2}),
-        )
-    )
-    assert [(row.label, row.n, row.cells[0].mean) for row in section.rows] == [
-        ("streetgs+removal schedule.removal_db=0.1", 1, 30.0),
-        ("streetgs+removal schedule.removal_db=0.2", 1, 31.0),
-    ]
-
-
-def test_three_repeats_are_one_row():
-    (section,) = sections(records(*(make_summary("m", seed, psnr=20.0 + seed) for seed in (2, 0, 1))))
-    (row,) = section.rows
-    assert (row.n, row.runs, row.cells[0]) == (3, "n=3 (seed 0,1,2)", Spread(21.0, 1.0, 3))
 
 
 def test_only_shared_seeds_are_paired():
@@ -289,12 +282,6 @@ def test_two_meanings_of_one_metric_do_not_meet_in_a_table():
         sections(records(first, second))
 
 
-def test_spread():
-    assert spread([]) is None
-    assert spread([3.0]) == Spread(3.0, None, 1)
-    assert spread([1.0, 2.0, 6.0]).sd == pytest.approx(7**0.5)
-
-
 def test_a_time_of_a_busy_machine_is_marked_and_compared_with_no_other():
     """The plain training of seed 0 was disturbed, and all frames of ours. Left: 100 s of 400 s with seed 1."""
     found = records(
@@ -306,7 +293,7 @@ def test_a_time_of_a_busy_machine_is_marked_and_compared_with_no_other():
         ),
     )
     (section,) = sections(found, "plain")
-    lines = [line.split(" | ") for line in markdown([section]).splitlines() if line.startswith("| ")]
+    lines = [line.split(" | ") for line in sections_markdown([section]).splitlines() if line.startswith("| ")]
     ms, seconds = (lines[0].index(heading) for heading in ("ms/frame", "train s |"))
     plain, ours, against = lines[2:]
     assert (plain[ms], plain[seconds]) == ("40.0 ± 0.0", "650 ± 354 § |")
@@ -316,3 +303,269 @@ def test_a_time_of_a_busy_machine_is_marked_and_compared_with_no_other():
     assert said in section.notes
     (quiet,) = sections(PLAIN_AND_OURS, "plain")
     assert not any("§" in note for note in quiet.notes)
+
+
+def text_of(found, baseline=None):
+    return sections_markdown(sections(found, baseline))
+
+
+def test_markdown_reads_as_written_by_hand():
+    lines = text_of(PLAIN_AND_OURS, "plain").splitlines()
+    assert lines[0] == "### street (64x48; held out: every 10th frame from 0)"
+    header, rule, plain, ours, difference = (line.split(" | ") for line in lines[2:7])
+    assert len(header) == len(rule) == len(plain) == len(ours) == len(difference)
+    assert header[:3] == ["| method", "runs", "PSNR"]
+    assert plain[:3] == ["| plain", "n=2 (seed 0,1)", "26.00 ± 1.41"]
+    assert ours[:3] == ["| ours", "n=2 (seed 0,1)", "25.75 ± 1.20"]
+    assert difference[2] == "-0.25 ± 0.21"
+    assert difference[header.index("Gaussians")] == "29.2 ± 5.9 %"
+    assert "**" not in text_of(PLAIN_AND_OURS, "plain")
+
+
+def test_a_table_by_camera_has_rows_of_cameras():
+    runs = [rig((25.0, 28.0, 22.0), 24.0, label=label) for label in ("ours", "plain")]
+    text = text_of(records(*runs), "plain")
+    table = text[text.index("### PSNR by camera") :].splitlines()[2:9]
+    assert table[:4] == [
+        "| method | plain | ours | ours against plain |",
+        "| --- | ---: | ---: | ---: |",
+        "| runs | n=1 (seed 0) | n=1 (seed 0) | n=1 (seed 0) |",
+        "| camera 1 | 25.00 | 25.00 | +0.00 |",
+    ]
+    assert table[6] == "| camera 10 | 24.00 | 24.00 | +0.00 |"
+    printed_text = printed(records(*runs), 80, "plain")
+    assert "camera 1 beyond" in printed_text
+    assert printed_text.count("runs ") == 2
+
+
+def test_a_single_run_says_so_and_has_no_spread():
+    text = text_of(PLAIN_AND_OURS[:1])
+    assert "| plain | n=1 (seed 0) | 25.00 |" in text
+    assert "n=1 has no spread" in text
+
+
+def test_cells_of_fewer_runs_than_the_row_carry_their_number():
+    assert "22.00 (n=1)" in text_of(records(make_summary(seed=0), make_summary(seed=1, vehicle_psnr=None)))
+    assert "| - |" in text_of(records(make_summary(), make_summary("ours", vehicle_psnr=None)))
+
+
+def test_counts_that_a_cap_held_down_are_marked():
+    capped = make_summary("streetgs", caps={"background": 1000})
+    text = text_of(records(capped, make_summary("streetgs+paper")), "streetgs")
+    plain, paper, difference = (line for line in text.splitlines() if line.startswith("| streetgs"))
+    assert plain.count("†") == difference.count("†") == 3  # the total and two nodes, nothing else
+    assert "1,200 †" in plain
+    assert "100.0 % †" in difference
+    assert "†" not in paper
+
+
+def printed(found, width, baseline=None):
+    console = Console(width=width)
+    with console.capture() as capture:
+        for part in section_tables(sections(found, baseline), width):
+            console.print(part)
+    return capture.get()
+
+
+def test_a_few_methods_fit_a_terminal_of_80_characters():
+    text = printed(PLAIN_AND_OURS, 80, "plain")
+    for cell in ("26.00 ± 1.41", "25.75 ± 1.20", "-0.25 ± 0.21", "29.2 ± 5.9 %", "1,400 ± 283", "every 10th frame"):
+        assert cell in text
+    assert "…" not in text
+    assert "mean ± sample sd over runs; n=1 has no spread and proves nothing below the noise" in text  # its whole width
+    assert text.count("┏") == 1
+
+
+SWEEP = records(*(make_summary("streetgs+removal", config={"schedule.removal_db": value}) for value in range(6)))
+
+
+def test_many_variants_are_rows_where_there_is_room():
+    title, found, notes = section_tables(sections(SWEEP), 200)
+    table = as_a(Table, found)
+    assert table.row_count == 6
+    assert str(table.columns[0].header) == "method"
+    assert "…" not in printed(SWEEP, 200)
+    assert "held out" in str(title)
+    assert "guards: none fired" in str(notes)
+
+
+def test_many_variants_are_tables_below_each_other_where_there_is_none():
+    text = printed(SWEEP, 80)
+    assert text.count("┏") > 1
+    assert all(f" schedule.removal_db={value} " in text for value in range(6))
+    assert text.count("n=1 (seed 0) ") == 6
+    assert "…" not in text
+    assert text.count("held out:") == 1  # one title
+    assert text.count("guards: none fired") == 1
+
+
+def test_every_run_is_a_point_in_its_variants_color(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, path: drawn.append((self, path)))
+    runs = [street(*values) for values in STREETS]
+    size_figure(records(*runs, make_summary("blind", psnr=None, training_psnr=30.0)), tmp_path / "runs.png")
+    ((canvas, path),) = drawn
+    assert path == tmp_path / "runs.png"
+    ours, plain = canvas.axes[0].collections
+    assert plain.get_offsets().tolist() == [[100, 30], [200, 32], [300, 31]]
+    assert ours.get_offsets().tolist() == [[50, 29], [50, 32.5], [150, 30]]
+    assert [text.get_text() for text in canvas.axes[0].get_legend().get_texts()] == ["ours (n=3)", "plain (n=3)"]
+    with pytest.raises(ValueError, match="no run was evaluated on held-out views"):
+        size_figure(records(make_summary(psnr=None, training_psnr=30.0)), tmp_path / "runs.png")
+
+
+def shown(summary, protocol):
+    (section,) = sections(records(summary), protocol=protocol)
+    return {heading: cell.mean for heading, cell in cells(section.rows[0], section).items() if cell is not None}
+
+
+def test_a_protocol_chooses_the_columns():
+    """Every metric has a value of its own."""
+    values = {name: float(place) for place, name in enumerate(DEFINITIONS, start=1)}
+    quality = {HELD_OUT: {name: MetricSummary(value, 0.0, 6, 0) for name, value in values.items()}}
+    summary = dataclasses.replace(make_summary(), quality=quality)
+    headings = ("vehicle PSNR", "vehicle SSIM", "human PSNR", "human SSIM")
+    for protocol, lpips in ((DRIVESTUDIO, ("LPIPS alex",)), (STRICT, ("LPIPS alex", "LPIPS vgg"))):
+        found = shown(summary, protocol)
+        names = (*("PSNR", "SSIM"), *lpips, *headings)
+        metrics = (protocol.psnr, protocol.ssim, *protocol.lpips, *protocol.vehicle, *protocol.human)
+        assert {name: found[name] for name in names} == {
+            name: values[metric] for name, metric in zip(names, metrics, strict=True)
+        }
+        assert found["near PSNR"] == values["psnr_near_lidar"]
+    assert "LPIPS vgg" not in shown(summary, DRIVESTUDIO)
+
+
+def test_brackets_of_a_label_are_no_markup():
+    """A label comes from outside: ``[red]`` stands in the terminal as it is written, and colors nothing."""
+    runs = [record(make_summary("[red]mine", scene="[/b]street")), record(make_summary("[bold]x", scene="[/b]street"))]
+    out = io.StringIO()
+    console = Console(file=out, width=200, force_terminal=True, color_system="standard")
+    for part in section_tables(sections(runs), 200):
+        console.print(part)
+    text = out.getvalue()
+    assert all(word in text for word in ("[red]mine", "[bold]x", "[/b]street"))
+    assert "\x1b[31m" not in text
+
+
+def notes(*summaries, baseline=None):
+    return sections(records(*summaries), baseline)[-1].notes
+
+
+def note(start, *summaries, baseline=None):
+    (found,) = [one for one in notes(*summaries, baseline=baseline) if one.startswith(start)]
+    return found
+
+
+OTHER = dataclasses.replace(MACHINE, cores=64)
+NEWER = CodeVersion("fedcba9876543210", False)
+DIRTY = CodeVersion("0123456789abcdef", True)
+
+
+def test_like_runs_get_no_warning():
+    said = "\n".join(notes(make_summary(), make_summary("ours")))
+    for word in ("not comparable", "different", "uncommitted", "stopped", "reached", "times", "has no run"):
+        assert word not in said
+    assert "trained on cpu: test, 2 threads, 2 cores, torch 2.13.0" in said
+    assert "guards: none fired" in said
+
+
+@pytest.mark.parametrize(
+    "other", [{"device": "cuda: big"}, {"evaluated": Evaluation("e", OTHER, CLEAN, "cpu: test", 2)}]
+)
+def test_clocks_of_different_places_are_called_incomparable(other):
+    said = note("ms/frame are not comparable, measured on: ", make_summary(), make_summary("ours", **other))
+    assert said.count(";") == 1
+
+
+def test_trainings_at_different_places_are_called_incomparable():
+    for other in (make_summary("ours", threads=1), make_summary("ours", machine=OTHER)):
+        said = note("train s are not comparable, trained on: ", make_summary(), other)
+        assert "cpu: test, 2 threads, 2 cores" in said
+        assert said.count(";") == 1
+    assert "cpu: test, 1 thread, 2 cores" in note("trained on", make_summary(threads=1))
+    two = dataclasses.replace(make_summary(), run=dataclasses.replace(make_summary().run, device="cuda: big"))
+    assert "cuda: big" in note("train s are not comparable", make_summary(), two)
+
+
+def test_commits_and_uncommitted_changes_are_named():
+    assert note("runs were trained by", make_summary(), make_summary("ours", source=NEWER)) == (
+        "runs were trained by different commits: 012345678, fedcba987"
+    )
+    assert "some runs were trained by code with uncommitted changes" in notes(make_summary(source=DIRTY))
+    measured = make_summary(evaluated=Evaluation("e", MACHINE, DIRTY, "cpu: test", 2))
+    assert "some runs were measured by code with uncommitted changes" in notes(measured)
+    measured = make_summary(evaluated=Evaluation("e", MACHINE, NEWER, "cpu: test", 2))
+    assert note("runs were measured by different", make_summary(), measured)
+
+
+def test_caps_are_named_and_mark_what_they_hold_down():
+    capped = make_summary("streetgs", caps={"background": 130_000, "rigid": 8000})
+    free = make_summary("streetgs+paper")
+    expected = "† streetgs: background reached its cap of 130,000 Gaussians, rigid reached its cap of 8,000 Gaussians"
+    assert expected in notes(capped, free, make_summary("streetgs", 1))
+    (section,) = sections(records(capped, free), "streetgs")
+    assert [row.capped for row in section.rows] == [True, False, True]
+    (section,) = sections(records(make_summary("streetgs"), make_summary("a", caps={"rigid": 5})), "streetgs")
+    assert [row.capped for row in section.rows] == [False, True, True]
+
+
+def test_the_same_run_twice_is_no_repeat():
+    twice = [make_summary("m", 0), make_summary("m", 0), make_summary("m", 1)]
+    assert "m: seed 0 2 times; equal runs of one seed are no independent repeats" in notes(*twice)
+    apart = [make_summary("m", 0, scene="a"), make_summary("m", 0, scene="b")]
+    assert not [one for one in notes(*apart) if "times" in one]
+
+
+def test_a_run_that_was_stopped_is_named():
+    assert "plain (seed 3) stopped at step 23 of 60" in notes(make_summary(seed=3, steps=23))
+
+
+def test_options_that_a_name_has_no_room_for():
+    runs = [make_summary("m", config={f"a{index}": index * value for index in range(1, 6)}) for value in (1, 10)]
+    said = [one for one in notes(*runs) if one.startswith("m a1=")]
+    assert len(said) == 2
+    assert "a1=1, a2=2, a3=3, a4=4, a5=5" in "\n".join(said)
+
+
+def test_guards_that_fired_are_named():
+    calm = make_summary()
+    loud = make_summary("ours", 3, alarms={"vanished": 1234, "color_held": 1})
+    assert note("guards", calm, loud) == "guards: ours (seed 3) vanished 1,234, color_held 1"
+    assert note("guards", loud, make_summary("plain", 1, alarms={"overflowed": 7})) == (
+        "guards: ours (seed 3) vanished 1,234, color_held 1; plain (seed 1) overflowed 7"
+    )
+
+
+def test_a_mean_over_scenes_says_which():
+    said = notes(*(street(*values) for values in STREETS[:5]), baseline="plain")
+    assert "scenes: 320x192_seed0, 320x192_seed1, 320x192_seed2" in said
+    assert "ours has no run of 320x192_seed2: compare differences, not means" in said
+    assert said[0] == "each scene counts once, with the mean of its runs; ± is the sample sd over scenes"
+    assert said[-1] == "differences are to plain, paired by scene and seed; per cent is what remains of it"
+
+
+def test_seeds_that_a_variant_lacks_are_named():
+    runs = [make_summary("plain", 0), make_summary("plain", 1), make_summary("ours", 1)]
+    assert "ours has no run of street with seed 0: compare differences, not means" in notes(*runs)
+    lacking = [street(name, seed, 20.0, 100) for name in ("plain", "ours") for seed in (0, 1)]
+    assert not [said for said in notes(*lacking) if "with seed" in said]
+
+
+def test_near_and_beyond_are_explained_where_there_is_lidar():
+    blind = make_summary()
+    assert not [said for said in notes(blind) if said.startswith("near")]
+    seen = {HELD_OUT: blind.quality[HELD_OUT] | {"psnr_beyond_lidar": MetricSummary(20.0, None, 1, 0)}}
+    said = note("near:", blind, dataclasses.replace(make_summary("ours"), quality=seen))
+    assert said.startswith("near: psnr_near_lidar, of pixels with a lidar return within 4 % of the longer image side")
+
+
+def test_which_views_the_metrics_are_of():
+    assert note("of held-out views, protocol drivestudio: PSNR psnr_full", make_summary(training_psnr=30.0))
+    assert note("of training views (none is held out), protocol", make_summary(psnr=None, training_psnr=30.0))
+
+
+def test_a_metric_that_could_not_be_measured_is_explained_once():
+    reason = "no weights (a.ckpt): install them"
+    said = notes(make_summary(absent={"lpips_alex": reason, "lpips_vgg": "?"}), make_summary("b"))
+    assert [one for one in said if "n/a" in one] == [f"lpips_alex n/a in some runs: {reason}"]

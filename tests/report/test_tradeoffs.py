@@ -1,32 +1,27 @@
-"""Differences and best arms against numbers worked out by hand."""
+"""Differences and best variants against numbers worked out by hand."""
 
 from dataclasses import replace
 
 import pytest
+from scipy import stats
 
 from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
-from sparsestreet.records.quality import HELD_OUT, MetricSummary
-from sparsestreet.report.arms import arms
-from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired
+from sparsestreet.records.summary import HELD_OUT, MetricSummary
+from sparsestreet.report.collect import run_frame
+from sparsestreet.report.tables import t_interval
+from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired, summary_line
+from sparsestreet.report.variants import variants
 from tests.evaluation.frames import disturbed, make_summary
 from tests.report.sweep_folder import record, street_runs
 
 
 @pytest.fixture(scope="module")
 def found():
-    return arms([record(run, name) for name, run in street_runs().items()])
+    return variants([record(run, name) for name, run in street_runs().items()])
 
 
 def by_heading(grid, row):
     return {heading: cell for (_, heading), cell in zip(grid.header, row, strict=True)}
-
-
-def test_pairs_are_of_a_scene_and_a_seed(found):
-    plain, removal, _ = found
-    loss = paired(removal, plain, lambda run: run.mean("psnr_full"))
-    # -0.2, -0.3, -0.4: t(2) = 4.303, sd 0.1
-    assert loss.mean == pytest.approx(-0.3)
-    assert loss.high - loss.mean == pytest.approx(4.303 * 0.1 / 3**0.5, abs=1e-3)
 
 
 def test_seeds_of_one_scene_are_the_pairs_else_scenes_are():
@@ -35,11 +30,11 @@ def test_seeds_of_one_scene_are_the_pairs_else_scenes_are():
         ("plain+removal", "a", 0): 19.0, ("plain+removal", "a", 1): 19.0, ("plain+removal", "b", 0): 29.0,
     }  # fmt: skip
     records = [record(make_summary(label, seed, value, scene=scene)) for (label, scene, seed), value in runs.items()]
-    plain, removal = arms(records)
-    both = paired(removal, plain, lambda run: run.mean("psnr_full"))
+    plain, removal = variants(records)
+    both = paired(removal, plain, "held_out psnr_full")
     assert (both.mean, both.n) == (pytest.approx(-1.25), 2)  # scene a: -1.5, scene b: -1
-    plain, removal = arms([one for one in records if one.summary.run.scene == "a"])
-    alone = paired(removal, plain, lambda run: run.mean("psnr_full"))
+    plain, removal = variants([one for one in records if one.summary.run.scene == "a"])
+    alone = paired(removal, plain, "held_out psnr_full")
     assert (alone.mean, alone.n) == (pytest.approx(-1.5), 2)
 
 
@@ -56,14 +51,14 @@ def test_bold_where_the_interval_excludes_zero(found):
 
 def test_one_pair_is_never_bold():
     runs = [make_summary("plain", 0, 25.0), make_summary("plain+removal", 0, 20.0)]
-    grid = differences(arms([record(run) for run in runs]), DRIVESTUDIO)
+    grid = differences(variants([record(run) for run in runs]), DRIVESTUDIO)
     cell = by_heading(grid, grid.rows[0])
     assert (cell["PSNR full"].text, cell["PSNR full"].bold, cell["n"].text) == ("-5.00", False, "1")
 
 
 def test_a_share_of_a_capped_run_is_marked_as_one():
     runs = [make_summary("plain", 0, 25.0, caps={"road": 900}), make_summary("plain+removal", 0, 24.9)]
-    found = arms([record(run) for run in runs])
+    found = variants([record(run) for run in runs])
     for make, named in (
         (differences, "plain+removal - plain †"),
         (matched_quality, "plain †, at most 0.1 dB"),
@@ -72,46 +67,30 @@ def test_a_share_of_a_capped_run_is_marked_as_one():
         grid = make(found, DRIVESTUDIO)
         assert grid.rows[0][0].text == named
         assert "a share of its Gaussians is a share of that limit" in grid.notes[-1]
-        free = make(arms([record(make_summary(run.run.label, 0, 25.0)) for run in runs]), DRIVESTUDIO)
+        free = make(variants([record(make_summary(run.run.label, 0, 25.0)) for run in runs]), DRIVESTUDIO)
         assert not any("†" in text for text in (free.rows[0][0].text, *free.notes))
 
 
 def test_an_arm_without_its_plain_run_is_named():
-    grid = differences(arms([record(make_summary("plain+removal"))]), DRIVESTUDIO)
+    grid = differences(variants([record(make_summary("plain+removal"))]), DRIVESTUDIO)
     assert not grid.rows
     assert "to compare with: plain+removal" in grid.notes[-1]
 
 
-def test_the_smallest_arm_of_a_quality(found):
-    chosen = {row[0].text: by_heading(grid, row) for grid in [matched_quality(found, DRIVESTUDIO)] for row in grid.rows}
-    assert chosen["streetgs, at most 0.1 dB"]["arm"].text == "streetgs"
-    assert chosen["streetgs, at most 0.5 dB"]["arm"].text == "streetgs+removal"
-    assert chosen["streetgs, at most 0.5 dB"]["Gaussians"].text == "2,510"
-
-
-def test_the_best_arm_of_a_budget(found):
-    grid = matched_budget(found, DRIVESTUDIO)
-    chosen = {row[0].text: by_heading(grid, row) for row in grid.rows}
-    assert chosen["streetgs, at most 25 % of its Gaussians"]["arm"].text == "none of this sweep"  # 25.1 %
-    half = chosen["streetgs, at most 50 % of its Gaussians"]
-    assert (half["arm"].text, half["PSNR full, dB"].text, half["share, %"].text) == ("streetgs+removal", "-0.30", "25")
-    assert half["train minutes"].text == "1.67"  # 100 seconds
-
-
 def test_a_larger_arm_within_the_budget_is_better():
-    """Of two arms below half of the Gaussians the one that loses less, not the smaller one."""
+    """Of two variants below half of the Gaussians the one that loses less, not the smaller one."""
     counts = {"plain": (25.0, 1000), "plain+small": (23.0, 100), "plain+larger": (24.5, 400)}
     runs = [make_summary(label, 0, psnr, {"background": rows}) for label, (psnr, rows) in counts.items()]
-    grid = matched_budget(arms([record(run) for run in runs]), DRIVESTUDIO)
+    grid = matched_budget(variants([record(run) for run in runs]), DRIVESTUDIO)
     chosen = {row[0].text: by_heading(grid, row)["arm"].text for row in grid.rows}
     assert chosen["plain, at most 25 % of its Gaussians"] == "plain+small"
     assert chosen["plain, at most 50 % of its Gaussians"] == "plain+larger"
 
 
 def test_a_control_is_never_chosen_but_named():
-    """The capped method is smaller and better than what it controls: the tables choose the arm and say so."""
+    """The capped method is smaller and better than what it controls: the tables choose the variant and say so."""
     runs = {"plain": (25.0, 1000), "plain+removal": (24.8, 400), "plain+capped": (24.9, 300)}
-    made = arms([record(make_summary(name, 0, psnr, {"background": n})) for name, (psnr, n) in runs.items()])
+    made = variants([record(make_summary(name, 0, psnr, {"background": n})) for name, (psnr, n) in runs.items()])
     quality, budget = matched_quality(made, DRIVESTUDIO), matched_budget(made, DRIVESTUDIO)
     control = "control: plain+capped, -0.10 dB at 30 % of the Gaussians, is"
     assert [row[1].text for row in quality.rows] == ["plain", "plain+removal", "plain+removal"]
@@ -123,17 +102,17 @@ def test_a_control_is_never_chosen_but_named():
 
 
 def test_a_chosen_arm_has_the_numbers_of_the_seeds_it_shares():
-    """Seed 1, which the plain arm lacks, has 900 Gaussians and is in no number of the row."""
+    """Seed 1, which the plain variant lacks, has 900 Gaussians and is in no number of the row."""
     runs = [("plain", 0, 25.0, 1000), ("plain+removal", 0, 24.9, 300), ("plain+removal", 1, 20.0, 900)]
-    made = arms([record(make_summary(name, seed, psnr, {"background": n})) for name, seed, psnr, n in runs])
+    made = variants([record(make_summary(name, seed, psnr, {"background": n})) for name, seed, psnr, n in runs])
     chosen = by_heading(matched_quality(made, DRIVESTUDIO), matched_quality(made, DRIVESTUDIO).rows[-1])
     assert (chosen["arm"].text, chosen["share, %"].text, chosen["Gaussians"].text) == ("plain+removal", "30", "300")
 
 
 def test_a_gain_is_no_loss():
-    """An arm that is smaller and better by 0.6 dB is within every limit."""
+    """A variant that is smaller and better by 0.6 dB is within every limit."""
     runs = [make_summary("plain", 0, 25.0), make_summary("plain+removal", 0, 25.6, {"background": 300})]
-    grid = matched_quality(arms([record(run) for run in runs]), DRIVESTUDIO)
+    grid = matched_quality(variants([record(run) for run in runs]), DRIVESTUDIO)
     chosen = [by_heading(grid, row) for row in grid.rows]
     assert [(row["arm"].text, row["PSNR full, dB"].text) for row in chosen] == [("plain+removal", "+0.60")] * 3
 
@@ -151,7 +130,7 @@ def apart(label, quality, gaussians, milliseconds, seconds):
 def test_every_column_has_a_difference_of_its_own(protocol):
     """Ours is better by 0.5 in every metric, has a quarter of the Gaussians, half of the frame and 90 % of training."""
     plain, ours = apart("m", 20.0, 1000, 40.0, 200.0), apart("m+removal", 20.5, 250, 20.0, 180.0)
-    grid = differences(arms([record(plain, "p"), record(ours, "r")]), protocol)
+    grid = differences(variants([record(plain, "p"), record(ours, "r")]), protocol)
     networks = {DRIVESTUDIO: ("LPIPS alex",), STRICT: ("LPIPS alex", "LPIPS vgg")}[protocol]
     (row,) = (by_heading(grid, row) for row in grid.rows)
     assert {heading: cell.text for heading, cell in row.items()} == {
@@ -163,7 +142,8 @@ def test_every_column_has_a_difference_of_its_own(protocol):
     }
     assert {cell.runs for cell in row.values()} == {("r", "p")}
     # Which metric a column holds: the plain run's own number.
-    values = {one.heading: one.value(plain) for one in measures(protocol)}
+    (numbers,) = run_frame([record(plain)]).to_dict("records")
+    values = {one.heading: numbers[one.column] for one in measures(protocol)}
     wanted = (protocol.psnr, protocol.human[0], protocol.vehicle[0], protocol.ssim, *protocol.lpips)
     assert [values[name] for name in list(values)[: len(wanted)]] == [plain.mean(name) for name in wanted]
     assert [values[name] for name in ("Gaussians", "MB", "ms/frame", "train s")] == [1000.0, 0.236, 40.0, 200.0]
@@ -173,7 +153,7 @@ def test_a_chosen_arm_is_shown_with_all_its_numbers():
     """A third of 1,200 Gaussians for 0.25 dB; MB: 59 float32 a Gaussian."""
     plain = make_summary("m", 0, 25.0, {"a": 1200}, milliseconds=40.0, training_seconds=200.0)
     ours = make_summary("m+removal", 0, 24.75, {"a": 400}, milliseconds=25.0, training_seconds=150.0)
-    found = arms([record(plain, "p"), record(ours, "r")])
+    found = variants([record(plain, "p"), record(ours, "r")])
     for grid, allowed in ((matched_quality, "at most 0.3 dB"), (matched_budget, "at most 50 % of its Gaussians")):
         chosen = grid(found, DRIVESTUDIO)
         assert [heading for _, heading in chosen.header[1:]] == [
@@ -190,7 +170,7 @@ def test_a_chosen_arm_is_shown_with_all_its_numbers():
 def test_a_limit_itself_is_allowed():
     """Half of the Gaussians, and half a dB less: 0.5 is exact in floats."""
     runs = [make_summary("m", 0, 25.0, {"a": 8}), make_summary("m+removal", 0, 24.5, {"a": 4})]
-    found = arms([record(run) for run in runs])
+    found = variants([record(run) for run in runs])
     assert [row[1].text for row in matched_quality(found, DRIVESTUDIO).rows] == ["m", "m", "m+removal"]
     assert matched_budget(found, DRIVESTUDIO).rows[1][1].text == "m+removal"
 
@@ -199,7 +179,7 @@ def test_an_interval_of_fewer_pairs_than_the_row_says_how_many():
     """Two seeds, of which one lacks vehicles."""
     runs = [make_summary(label, seed, vehicle_psnr=None if seed else 20.0, training_seconds=100.0 + seed)
             for label in ("m", "m+removal") for seed in (0, 1)]  # fmt: skip
-    (row,) = differences(arms([record(run) for run in runs]), DRIVESTUDIO).rows
+    (row,) = differences(variants([record(run) for run in runs]), DRIVESTUDIO).rows
     texts = [cell.text for cell in row]
     assert texts[1] == "2"
     assert "+0.00 (n=1)" in texts
@@ -207,15 +187,15 @@ def test_an_interval_of_fewer_pairs_than_the_row_says_how_many():
 
 def test_who_has_no_plain_value_has_no_relative_difference():
     runs = [make_summary("m", training_seconds=None), make_summary("m+removal", training_seconds=100.0)]
-    grid = differences(arms([record(run) for run in runs]), DRIVESTUDIO)
+    grid = differences(variants([record(run) for run in runs]), DRIVESTUDIO)
     assert by_heading(grid, grid.rows[0])["train s, %"].text == "-"
     zero = [make_summary("m", training_seconds=0.0), make_summary("m+removal", training_seconds=100.0)]
-    grid = differences(arms([record(run) for run in zero]), DRIVESTUDIO)
+    grid = differences(variants([record(run) for run in zero]), DRIVESTUDIO)
     assert by_heading(grid, grid.rows[0])["train s, %"].text == "-"
 
 
 def test_a_difference_of_times_is_of_quiet_pairs_alone():
-    """Of the plain frames one seed was disturbed, of the small arm's training every seed."""
+    """Of the plain frames one seed was disturbed, of the small variant's training every seed."""
     runs = [
         disturbed(make_summary("plain", 0, milliseconds=900.0), "frames"),
         make_summary("plain", 1, milliseconds=20.0),
@@ -224,10 +204,89 @@ def test_a_difference_of_times_is_of_quiet_pairs_alone():
             for seed in (0, 1)
         ),
     ]  # fmt: skip
-    found = arms([record(run) for run in runs])
+    found = variants([record(run) for run in runs])
     grid = differences(found, DRIVESTUDIO)
     row = by_heading(grid, grid.rows[0])
     assert (row["ms/frame, %"].text, row["train s, %"].text) == ("-75.0 (n=1)", "§")
     assert grid.notes[-1].endswith("frames of plain; training of plain+removal")
     best = matched_quality(found, DRIVESTUDIO)
     assert by_heading(best, best.rows[0])["train minutes"].text.endswith(" §")
+
+
+def runs(label: str, psnr: list[float], gaussians: int, **changes):
+    return [
+        make_summary(label, seed, value, {"background": gaussians}, scene=f"street {seed}", **changes)
+        for seed, value in enumerate(psnr)
+    ]
+
+
+def said(*made):
+    return summary_line(
+        variants([record(run, f"{run.run.label}{run.run.seed}") for some in made for run in some]), DRIVESTUDIO
+    )
+
+
+PLAIN = runs("m", [25.0, 26.0, 27.0], 1000)
+GOOD = runs("m+removal", [24.9, 25.8, 26.7], 400)
+"""-0.1, -0.2, -0.3: t(2) = 4.303, sd 0.1, so 0.248 to each side."""
+SMALLEST = runs("m+masks", [24.5, 25.5, 26.5], 100)
+"""-0.5 each."""
+
+
+def test_the_smallest_arm_within_the_loss():
+    larger = runs("m+paper", [25.0, 26.0, 27.0], 500)
+    assert said(PLAIN, GOOD, SMALLEST, larger) == (
+        "m: of 3 arms the smallest within 0.3 dB is m+removal, with 40 % of the Gaussians, -0.20 dB [-0.45, +0.05] of "
+        "held-out PSNR, n = 3.",
+        "Intervals that reach beyond 0.3 dB: m+removal. More scenes or seeds may change this.",
+    )
+
+
+def test_none_is_within_the_loss():
+    assert said(PLAIN, SMALLEST) == (
+        "m: none is smaller within 0.3 dB; m+masks has 10 % of the Gaussians, -0.50 dB [-0.50, -0.50] of held-out "
+        "PSNR, n = 3.",
+    )
+
+
+def test_two_pairs_say_nothing():
+    assert said(PLAIN[:2], GOOD[:2]) == ()
+    assert said(PLAIN, GOOD[1:]) == ()  # of three seeds the variant has two
+    assert said(PLAIN) == ()
+    assert said(GOOD) == ()
+
+
+def test_a_larger_arm_and_a_control_are_not_chosen():
+    larger, control = runs("m+masks", [25.0, 26.0, 27.0], 1100), runs("m+random", [25.0, 26.0, 27.0], 50)
+    (sentence,) = said(PLAIN, larger, control)
+    assert sentence.startswith("m: none is smaller within 0.3 dB; m+masks has 110 % of the Gaussians")
+
+
+def test_a_limit_of_the_plain_run_is_named():
+    found = said(runs("m", [25.0, 26.0, 27.0], 1000, caps={"background": 1000}), GOOD)
+    assert found[-1] == "A limit ended the growth of m: shares of it are shares of that limit."
+
+
+@pytest.mark.parametrize("label", ["a", "b"])
+def test_each_method_has_its_sentence(label):
+    others = [run for name in ("a", "b") for run in runs(name, [25.0, 26.0, 27.0], 1000)]
+    smaller = [run for name in ("a", "b") for run in runs(f"{name}+removal", [25.0, 26.0, 27.0], 500)]
+    found = said(others, smaller)
+    assert [sentence[0] for sentence in found] == ["a", "b"]
+    assert f"{label}: the smallest within 0.3 dB is {label}+removal, with 50 %" in found["ab".index(label)]
+
+
+def test_the_interval_is_students():
+    values = [-0.2, -0.3, -0.4]
+    interval = t_interval(values)
+    expected = stats.ttest_1samp(values, 0.0).confidence_interval(0.95)
+    assert (interval.mean, interval.n) == (pytest.approx(-0.3), 3)
+    assert (interval.low, interval.high) == (pytest.approx(expected.low), pytest.approx(expected.high))
+    assert interval.proven
+
+
+def test_what_proves_nothing():
+    assert not t_interval([-1.0]).proven  # one value, however large
+    assert t_interval([-1.0]).low is None
+    assert not t_interval([-1.0, 0.9]).proven
+    assert t_interval([]) is None

@@ -15,7 +15,7 @@ import torch
 import zstandard
 
 import sparsestreet
-from sparsestreet.codec import limits
+from sparsestreet.codec import container
 from sparsestreet.codec.container import FrameReader, FrameWriter
 from sparsestreet.scene import packing
 from sparsestreet.scene.beside import rig_record, views_of
@@ -238,8 +238,8 @@ def test_a_header_of_nested_lists(path: Path):
 
 
 def test_rows_that_unpack_to_more_than_the_file_may(path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(limits, "FREE", 2000)
-    monkeypatch.setattr(limits, "PER_BYTE", 1)
+    monkeypatch.setattr(container, "FREE", 2000)
+    monkeypatch.setattr(container, "PER_BYTE", 1)
     with pytest.raises(ValueError, match=r"claims .* unpacked, above its limit"):
         load_scene(path)
 

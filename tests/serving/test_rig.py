@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.geometry.cameras import inverse
-from sparsestreet.records.rig import RIG, RigRecord
+from sparsestreet.records.run import RIG, RigRecord
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.rig import rig_of
 from tests.export.street import street_views

@@ -14,7 +14,7 @@ from sparsestreet.data.datamodule import OrderedFrames, StreetData
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import Split
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.records.ledger import CountChange
+from sparsestreet.records.curves import CountChange
 from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.effects import Effect
 from sparsestreet.scene.gaussians import RowPlan, Rows

@@ -9,7 +9,7 @@ import pytest
 from lightning import Callback, Trainer
 from lightning.pytorch.loggers import CSVLogger
 
-from sparsestreet.records.logged import LOGGED, Logged
+from sparsestreet.records.curves import LOGGED, Logged
 from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
 from sparsestreet.training.curves import kept_curves
 from sparsestreet.training.run import CPU_TRAINER, fit

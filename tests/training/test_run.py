@@ -24,10 +24,8 @@ from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import StageRecorder
 from sparsestreet.ranks import ALONE
 from sparsestreet.records.configuration import config_hash
-from sparsestreet.records.costs import COSTS
-from sparsestreet.records.effects import EffectDecision
-from sparsestreet.records.run import RUN, CodeVersion, Machine
-from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
+from sparsestreet.records.costs import COSTS, STEP_PHASES, StepPhase
+from sparsestreet.records.run import RUN, CodeVersion, EffectDecision, Machine
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.graph import SceneGraph

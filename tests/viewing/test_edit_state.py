@@ -77,6 +77,8 @@ def test_what_the_file_said_stays():
     }
     assert "second" in edits.scene.nodes
     assert said["move"]["car"]["right"] == 1.0
+    edits.move("car", Offset())  # where it was recorded: there is no move whose time could be said
+    assert edits.said()["move"].keys() == {"tram"}
 
 
 def test_an_object_on_a_way_of_its_own_is_not_moved():
@@ -102,3 +104,10 @@ def test_what_was_dragged_stands_where_it_was_dropped(forward, right, up, turn):
     # Millimeters and hundredths of a degree are kept.
     np.testing.assert_allclose(list(asdict(offset).values()), [forward, right, up, turn], atol=0.0051)
     np.testing.assert_allclose((recorded @ offset.frame)[:3, 3], wanted[:3, 3], atol=0.0011)
+
+
+def test_a_turn_is_to_the_left_and_right_is_right():
+    """x ahead, y left: after a quarter turn what was ahead is on the left."""
+    frame = Offset(right=2.0, turn=90.0).frame
+    assert np.allclose(frame[:3, :3] @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], atol=1e-12)
+    assert np.allclose(frame[:3, 3], [0.0, -2.0, 0.0])

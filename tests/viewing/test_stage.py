@@ -9,7 +9,7 @@ import torch
 
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.viewing.edit_state import EditState, Offset
-from sparsestreet.viewing.poses import eye_of, matrix, wxyz_of
+from sparsestreet.viewing.object_panel import eye_of, matrix, wxyz_of
 from sparsestreet.viewing.stage import Eye, RecordedCamera, Stage
 from tests.export.street import stored_street, street_views
 
@@ -35,6 +35,20 @@ def test_a_recorded_camera_shows_the_recorded_view(stage):
     # The pose goes through its inverse twice.
     assert np.abs(stage.picture(recorded_eye(), 48, 32).astype(int) - expected).max() <= 1
     assert stage.picture(recorded_eye(), 24, 16).shape == (16, 24, 3)
+
+
+def test_views_of_a_part_of_the_log_have_a_clock_of_their_own():
+    """Of times 0.25 to 0.75: half of the log's seconds, and the first second shows what the camera saw then."""
+    stored = stored_street()
+    views = [view for view in street_views(cameras=(0,)) if 0.25 <= view.time <= 0.75]
+    stage = Stage(stored, views, EditState(stored.scene, {}, SECONDS, lambda path: (stored, 1.0)))
+    assert (stage.duration, stage.time) == (SECONDS / 2, 0.25)
+    stage.seek(1.0)
+    expected = (stored.render(views[1]).rgb.clamp(0, 1) * 255).round().byte().numpy()
+    assert stage.time == 0.5
+    assert np.abs(stage.picture(recorded_eye(), 48, 32).astype(int) - expected).max() <= 1  # as above
+    stage.seek(9.0)
+    assert stage.time == 0.75
 
 
 def test_edits_are_seen(stage):

@@ -194,7 +194,7 @@ def record_file(folder: Path, name: str, command: str) -> "RecordFile":
     import torch
 
     from sparsestreet.bench.records import Provenance, RecordFile
-    from sparsestreet.records.provenance import this_machine, this_source
+    from sparsestreet.records.run import this_machine, this_source
 
     provenance = Provenance(command, torch.get_num_threads(), this_machine(), this_source())
     return RecordFile(folder / f"{name}.jsonl", provenance)

@@ -13,8 +13,8 @@ from rich.text import Text
 from sparsestreet.cli.commands.report import report
 from sparsestreet.cli.config.compose import quoted
 from sparsestreet.records.summary import SUMMARY, RunSummary
-from sparsestreet.report.notes import BUSY, busy_note, frames_steady, training_steady
-from sparsestreet.report.side_by_side import compare_runs
+from sparsestreet.report.run_comparison import compare_runs
+from sparsestreet.report.tables import BUSY, busy_note, frames_steady, training_steady
 from sparsestreet.scene.centers import node_legend
 
 USAGE = """\

@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from sparsestreet.cli.config.compose import as_typed, composed, value_of
 from sparsestreet.cli.config.log_from_options import with_found_data
 from sparsestreet.cli.config.validate import config_problem, override_problem, with_effect_keys
-from sparsestreet.records.effects import EffectDecision
+from sparsestreet.records.run import EffectDecision
 
 if TYPE_CHECKING:
     from sparsestreet.scene.effects import EffectSettings
@@ -80,7 +80,7 @@ def known_effects(overrides: Sequence[str]) -> "tuple[Mapping[str, EffectSetting
 
 def _plan(cfg: DictConfig, out: Path | None) -> Iterator[str]:
     from sparsestreet.cli.config.assemble import data_of, recipe_of, with_views
-    from sparsestreet.pictures.evidence import draw_evidence
+    from sparsestreet.pictures.plots import draw_evidence
 
     started = time.perf_counter()
     data = data_of(cfg)

@@ -14,8 +14,7 @@ from sparsestreet.cli.config.targets import made, open_run_config
 from sparsestreet.cli.config.validate import device_of, type_problem
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.naming import printable
-from sparsestreet.records.provenance import this_machine
-from sparsestreet.records.run import RUN, RunDescription
+from sparsestreet.records.run import RUN, RunDescription, this_machine
 from sparsestreet.report.result import result_lines
 from sparsestreet.training.run import evaluate as evaluate_run
 

@@ -153,7 +153,7 @@ def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
 
 def _export_objects(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
     from sparsestreet.cli.commands.export_files import ANTIALIAS_LOST, lost_of_scene
-    from sparsestreet.export.object_files import POSES, write_objects
+    from sparsestreet.export.objects import POSES, write_objects
     from sparsestreet.export.ply import instance_names
 
     names = write_objects(request.out, stored, views.all)
@@ -169,10 +169,10 @@ def _export_objects(request: ExportRequest, stored: "StoredScene", views: "Recor
 def _export_page(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
     from sparsestreet.cli.commands.export_files import ANTIALIAS_LOST, lost_of_scene
     from sparsestreet.cli.commands.scenes import log_seconds
+    from sparsestreet.export.frame import dome_around
     from sparsestreet.export.page import viser_module, write_page
     from sparsestreet.export.path import recorded
     from sparsestreet.export.recording import recorded_parts
-    from sparsestreet.export.sky_dome import dome_around
 
     viser_module()  # before the work
     path = recorded(views.all)

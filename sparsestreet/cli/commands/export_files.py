@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sparsestreet.cli.commands.scenes import open_scene, recorded_views
-from sparsestreet.export.check import check_file, turned_camera
 from sparsestreet.export.frame import UNSEEN, VIEWER_FROM_WORLD, frame_gaussians
 from sparsestreet.export.ply import scene_gaussians, write_ply
-from sparsestreet.export.spz import read_spz, spz_notes, write_spz
+from sparsestreet.export.spz import check_file, read_spz, spz_notes, turned_camera, write_spz
 from sparsestreet.records.run import RUN
 from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.storage import StoredScene

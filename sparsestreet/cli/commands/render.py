@@ -13,7 +13,7 @@ from sparsestreet.cli.config.targets import open_run_config
 from sparsestreet.records.run import RUN
 
 if TYPE_CHECKING:
-    from sparsestreet.export.lidar import LidarReturns
+    from sparsestreet.export.layers import LidarReturns
     from sparsestreet.export.path import CameraPath
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.scene.views import RecordedViews
@@ -25,7 +25,7 @@ def lidar_of_run(run: Path, views: "RecordedViews", parts: Sequence[str] = ()) -
 
     Raises ValueError in one sentence where the log is not there, is another one, or has no lidar.
     """
-    from sparsestreet.export.lidar import LidarReturns
+    from sparsestreet.export.layers import LidarReturns
 
     try:
         config = open_run_config(run, parts)
@@ -161,7 +161,7 @@ def _render(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.commands.options import shown
     from sparsestreet.cli.commands.scenes import folder_of, open_scene, recorded_views, with_edits
-    from sparsestreet.export.seen import count_images
+    from sparsestreet.export.layers import count_images
     from sparsestreet.export.video import check_destination, check_size, picture_size
     from sparsestreet.scene.views import DEFAULT_FRAME_RATE
 
@@ -225,13 +225,12 @@ def _along_the_log(request: RenderRequest, views: "Sequence[View]", step: float)
 
 def _seen_by(request: RenderRequest, path: "CameraPath") -> "CameraPath":
     """The path with the cameras that were asked for."""
-    from sparsestreet.export import rig
-    from sparsestreet.export.path import resized
+    from sparsestreet.export.path import cropped, pinholes, raised, resized
 
-    path = path if request.up is None else rig.raised(path, request.up)
+    path = path if request.up is None else raised(path, request.up)
     path = path if request.width is None else resized(path, request.width)
-    path = path if request.height is None else rig.cropped(path, request.height)
-    return path if request.fov is None else rig.pinholes(path, request.fov)
+    path = path if request.height is None else cropped(path, request.height)
+    return path if request.fov is None else pinholes(path, request.fov)
 
 
 def _write(

@@ -10,11 +10,11 @@ from rich.console import Console
 from sparsestreet.cli.commands.options import run_command
 from sparsestreet.files import read_yaml
 from sparsestreet.metrics.definitions import PROTOCOLS, Protocol
-from sparsestreet.report import collect, figure, markdown, sections, tables
-from sparsestreet.report.arms import arms
-from sparsestreet.report.collect import keep_records
-from sparsestreet.report.figures_readme import time_figure
+from sparsestreet.report.collect import collect, keep_records
+from sparsestreet.report.figures import time_figure
+from sparsestreet.report.sections import section_tables, sections, sections_markdown, size_figure
 from sparsestreet.report.sweep import sweep_records, write_report
+from sparsestreet.report.variants import variants
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]
@@ -75,24 +75,24 @@ def _report(request: ReportRequest) -> None:
     records = collect(request.folders)
     found = sections(records, request.baseline, protocol)
     if request.figure is not None:
-        figure(records, request.figure)
+        size_figure(records, request.figure)
     wanted = request.sections
     shown = [one for one in found if wanted in ("all", "mean" if one.over_scenes else "scenes")]
     if not shown:
         raise ValueError("no configuration was run on two scenes, so there is no mean")
     console = Console()
-    for part in tables(shown, console.width):
+    for part in section_tables(shown, console.width):
         console.print(part)
     if request.markdown is not None:
-        request.markdown.write_text(markdown(shown))
+        request.markdown.write_text(sections_markdown(shown))
 
 
 def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> None:
     """Write the report of a sweep and say where."""
     written = write_report(folder, sweep_name(folder), protocol)
     if picture is not None:
-        time_figure(arms(sweep_records(folder)), protocol, picture)
-    for sentence in (*written.notes, *written.verdict):
+        time_figure(variants(sweep_records(folder)), protocol, picture)
+    for sentence in (*written.notes, *written.summary_line):
         print(sentence)
     print(f"{written.folder}: tables.md, tables.tex, tables.csv, figures, index.html")
 

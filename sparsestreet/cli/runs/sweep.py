@@ -26,7 +26,7 @@ from sparsestreet.cli.config.validate import SHOWS, SWEEPS, flags_of
 from sparsestreet.cli.runs.folder import folder_problem, holds_same_run, is_whole, same_run
 from sparsestreet.cli.runs.locks import FolderTakenError
 from sparsestreet.records.configuration import flat_config
-from sparsestreet.records.failures import FAILURE, FailedRun, read_failures
+from sparsestreet.records.run import FAILURE, FailedRun, read_failures
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
 

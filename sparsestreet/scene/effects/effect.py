@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestreet.pictures.panels import Panel
+from sparsestreet.pictures.images import Panel
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, rates_of
 from sparsestreet.scene.nodes.node import Node

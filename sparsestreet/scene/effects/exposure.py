@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from sparsestreet.evidence.exposure import ImageGains, image_gains
 from sparsestreet.evidence.gain_errors import EV, FEWEST_INSTANTS, GainErrors, gain_errors
 from sparsestreet.geometry.boxes import without_frames
-from sparsestreet.pictures.panels import Dots
+from sparsestreet.pictures.images import Dots
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.data.hood import LEAST_DRIVE
-from sparsestreet.pictures.panels import Marked
+from sparsestreet.pictures.images import Marked
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from sparsestreet.records.effects import EffectDecision
+from sparsestreet.records.run import EffectDecision
 from sparsestreet.scene.effects.effect import EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.evidence.shear import readout_shear, shear_over
-from sparsestreet.pictures.panels import Places
+from sparsestreet.pictures.images import Places
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.state import SceneState

@@ -13,7 +13,7 @@ from sparsestreet.evidence.sky import sky_share
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import over_sky
 from sparsestreet.ops.cube_map import colors_along
-from sparsestreet.pictures.panels import Marked
+from sparsestreet.pictures.images import Marked
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates

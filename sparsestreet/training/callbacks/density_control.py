@@ -12,7 +12,7 @@ from torch.utils.hooks import RemovableHandle
 
 from sparsestreet.phases import phase
 from sparsestreet.ranks import ALONE, Ranks
-from sparsestreet.records.ledger import CountChange
+from sparsestreet.records.curves import CountChange
 from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.generators import named_seed

@@ -6,7 +6,7 @@ from typing import Any
 
 from lightning import Callback, LightningModule, Trainer
 
-from sparsestreet.records.held_out import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.training.callbacks.clock import Clock
 
 COLUMNS = {"psnr_full": "val/psnr", "psnr_human": "val/psnr_human", "psnr_vehicle": "val/psnr_vehicle"}

@@ -7,7 +7,7 @@ from typing import Any
 from lightning import Callback, LightningModule, Trainer
 
 from sparsestreet.phases import PhaseRecorder, clock_of
-from sparsestreet.records.step_phases import STEP_PHASES, StepPhase
+from sparsestreet.records.costs import STEP_PHASES, StepPhase
 from sparsestreet.training.lightning import ends_step
 
 LOOP = "loop"

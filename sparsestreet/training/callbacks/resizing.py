@@ -4,7 +4,7 @@ import logging
 
 from lightning import Trainer
 
-from sparsestreet.records.ledger import CountChange
+from sparsestreet.records.curves import CountChange
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.lightning import callbacks_of, ranks_of
 from sparsestreet.training.parallel.agreement import check_agreement

@@ -6,7 +6,7 @@ from typing import Any
 
 from lightning import Callback, Trainer
 
-from sparsestreet.records.ledger import LEDGER, CountChange
+from sparsestreet.records.curves import LEDGER, CountChange
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.resizing import RowListener
 from sparsestreet.training.system import StreetSystem

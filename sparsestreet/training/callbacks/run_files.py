@@ -13,9 +13,8 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.speed import device_name
 from sparsestreet.noise import Calibration, calibrate, noise_between
 from sparsestreet.phases import stage
-from sparsestreet.records.ledger import CountChange
-from sparsestreet.records.rig import RIG, Matrix, RigRecord
-from sparsestreet.records.run import RUN, RunDescription
+from sparsestreet.records.curves import CountChange
+from sparsestreet.records.run import RIG, RUN, Matrix, RigRecord, RunDescription
 from sparsestreet.scene import views
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.storage import FILE_NAME, StoredScene, save_scene

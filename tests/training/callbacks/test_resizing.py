@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from sparsestreet.records.ledger import CountChange
+from sparsestreet.records.curves import CountChange
 from sparsestreet.scene.gaussians import RowPlan, Rows, Selection
 from sparsestreet.scene.masks import Mask, StaticMaskSettings
 from sparsestreet.scene.nodes import Background

@@ -6,7 +6,7 @@ import pytest
 import torch
 from lightning import Callback, Trainer
 
-from sparsestreet.records.ledger import LEDGER
+from sparsestreet.records.curves import LEDGER
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.masks import StaticMaskSettings

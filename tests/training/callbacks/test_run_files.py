@@ -10,8 +10,7 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog, VehiclePath
 from sparsestreet.ops import SplatSettings
-from sparsestreet.records.rig import RIG
-from sparsestreet.records.run import RUN
+from sparsestreet.records.run import RIG, RUN
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import load_scene

@@ -15,8 +15,7 @@ from sparsestreet.evaluation import evaluate
 from sparsestreet.evaluation.run import help_to_evaluate
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.costs import COSTS
-from sparsestreet.records.quality import HELD_OUT, QUALITY, TRAINING
-from sparsestreet.records.summary import RunSummary
+from sparsestreet.records.summary import HELD_OUT, QUALITY, TRAINING, RunSummary
 from sparsestreet.training.run import CPU_TRAINER, fit
 from tests.conftest import unchecked
 from tests.evaluation.dark import evaluate as evaluated
