@@ -9,10 +9,9 @@ from sparsestreet.data.colmap import binary, text
 from sparsestreet.data.images import check_pixels, image_size, read_image
 from sparsestreet.data.nuscenes.tables import all_rows
 from sparsestreet.data.ply import read_ply
+from sparsestreet.files import read_npz, read_yaml
+from sparsestreet.pickles import read_pickled
 from sparsestreet.records.strict_json import read_text
-from sparsestreet.safe_npz import read_npz
-from sparsestreet.safe_pickle import read_pickled
-from sparsestreet.safe_yaml import read_yaml
 from sparsestreet.training.callbacks.checkpoints import step_of
 
 

@@ -23,7 +23,7 @@ ROOMS = (
     "sparsestreet.noise",
     "sparsestreet.ops",
     "sparsestreet.phases",
-    "sparsestreet.safe_pickle",
+    "sparsestreet.pickles",
 )
 """Modules, and packages, in which everything public has an example: the names in ``__all__``, else each function."""
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sparsestreet.metrics.image import check_mask, check_pair
-from sparsestreet.safe_pickle import read_pickled
+from sparsestreet.pickles import read_pickled
 
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)

@@ -12,7 +12,7 @@ import numpy as np
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.data.lazy import Frames
-from sparsestreet.safe_npz import read_npz
+from sparsestreet.files import read_npz
 from sparsestreet.triangulation.points import TriangulatedPoints
 from sparsestreet.triangulation.settings import ImagePointSettings
 from sparsestreet.triangulation.street import StreetPoints, street_points

@@ -5,10 +5,11 @@ import random
 import shutil
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import pytest
+from _pytest.mark import ParameterSet
 from PIL import Image
 
 from sparsestreet.data.problems import LogError
@@ -89,7 +90,12 @@ def bomb(path: Path) -> None:
 
 
 LAUGHS = '<!DOCTYPE a [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;">]>'
-FETCHED = '<!DOCTYPE a SYSTEM "file:///etc/passwd">'
+
+
+def daily(faults: Collection[str], *chosen: str) -> list[ParameterSet]:
+    """Return all faults as parameters of a test; those that are not chosen are left to make test-all."""
+    assert set(chosen) <= set(faults)
+    return [pytest.param(one, id=one, marks=() if one in chosen else pytest.mark.slow) for one in faults]
 
 
 def assert_found(reader: RecordedReader, path: Path, said: str) -> None:

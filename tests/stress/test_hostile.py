@@ -25,9 +25,8 @@ from sparsestreet.data.images import image_size, read_image
 from sparsestreet.data.pandaset.frames import read_columns
 from sparsestreet.data.ply import read_ply
 from sparsestreet.evaluation.evaluate import Predictions
-from sparsestreet.safe_npz import read_npz
-from sparsestreet.safe_pickle import read_pickled
-from sparsestreet.safe_yaml import read_yaml
+from sparsestreet.files import read_npz, read_yaml
+from sparsestreet.pickles import read_pickled
 from sparsestreet.scene.body.smpl_file import SmplFile
 from sparsestreet.scene.edits import read_edits
 from sparsestreet.scene.storage import load_scene
@@ -192,7 +191,7 @@ FILES = {
     "an absurd checkpoint": Case(absurd_checkpoint, "last.ckpt", step_of, "is no checkpoint of a training"),
     "a zip bomb": Case(zip_bomb, "points.npz", read_npz, "its arrays would take 3,000,000,1"),
     "an absurd array": Case(absurd_npz, "points.npz", read_npz, "has 64 bytes"),
-    "an array that runs code": Case(running_npz, "points.npz", read_npz, "holds objects, whose pickle may run code"),
+    "an array that runs code": Case(running_npz, "points.npz", read_npz, "allow_pickle=False"),
     "YAML that runs code": Case(
         running_yaml, "edits.yaml", lambda path: read_edits(path, 1.0, no_scene), "could not determine a constructor"
     ),
@@ -274,7 +273,7 @@ OF_A_RUN = {
         ("train", "resume={run}"), "checkpoints/last.ckpt", packed_checkpoint, "is no checkpoint of a training"
     ),
     "a description of brackets": (("evaluate", "{run}"), "run.json", DEEP, "brackets in brackets without end"),
-    "a picture of 10^12 pixels": (("render", "{run}", "{run}.mp4"), "views.json", huge_views, "536870912 pixels"),
+    "a picture of 10^12 pixels": (("render", "{run}", "{run}.mp4"), "views.json", huge_views, "16,384 pixels a side"),
 }  # fmt: skip
 
 

@@ -14,7 +14,6 @@ from sparsestreet.report.arms import arms
 from sparsestreet.report.collect import keep_records
 from sparsestreet.report.figures_readme import time_figure
 from sparsestreet.report.sweep import sweep_records, write_report
-from sparsestreet.safe_yaml import read_yaml
 
 USAGE = """\
 sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]

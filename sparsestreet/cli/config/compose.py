@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sparsestreet.cli.config.option_files import CONF
 from sparsestreet.cli.config.resolvers import register_resolvers
-from sparsestreet.safe_yaml import read_yaml
+from sparsestreet.files import read_yaml
 
 register_resolvers()
 

@@ -12,8 +12,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from sparsestreet.cli.config.compose import configuration, load_run_config, quoted, value_of, without_flags
 from sparsestreet.cli.config.targets import check_modules, check_places, check_received, leaves
+from sparsestreet.files import read_yaml
 from sparsestreet.naming import checkpoint_fraction
-from sparsestreet.safe_yaml import read_yaml
 
 _PASSING = {"overrides", "runtime", "sweeper", "sweep"}
 """Keys of hydra's own configuration that follow from the words, or act in sweeps alone."""

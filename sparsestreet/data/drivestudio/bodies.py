@@ -20,7 +20,7 @@ from sparsestreet.data.poses import RIGIDITY_TOLERANCE
 from sparsestreet.data.problems import LogError, Problem, fault
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import NUM_JOINTS
-from sparsestreet.safe_pickle import read_pickled
+from sparsestreet.pickles import read_pickled
 from sparsestreet.types import BodyPoses, Track
 
 _MASKS = ("matched_mask", "must_appear_mask", "valid_mask")

@@ -39,7 +39,7 @@ class Tracklet:
 def read_tracklets(path: Path) -> list[Tracklet]:
     """In the order of the file; raises LogError with every object at fault."""
     found, problems, announced = [], [], None
-    for item in elements(path, 2, largest=_LARGEST, remedy=_REMEDY):
+    for item in elements(path, 2, max_bytes=_LARGEST, remedy=_REMEDY):
         try:
             if item.tag == "item":
                 found.append(_tracklet(item, path, f"object {len(found) + len(problems)}"))

@@ -62,7 +62,7 @@ def read_boxes(path: Path, frames: Int[np.ndarray, " f"], positions: Float64[np.
     """
     objects: dict[str, _Object] = {}
     problems: list[Problem] = []
-    for number, item in enumerate(elements(path, 1, largest=_LARGEST, remedy=_REMEDY)):
+    for number, item in enumerate(elements(path, 1, max_bytes=_LARGEST, remedy=_REMEDY)):
         if item.find("transform") is None:
             continue
         try:

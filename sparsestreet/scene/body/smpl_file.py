@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
+from sparsestreet.files import read_npz
 from sparsestreet.geometry.skeleton import NUM_JOINTS, PARENTS
-from sparsestreet.safe_npz import read_npz
-from sparsestreet.safe_pickle import read_pickled
+from sparsestreet.pickles import read_pickled
 from sparsestreet.scene.body.template import Body, BodyTemplate
 
 _NUM_SHAPES = 10

@@ -7,8 +7,8 @@ from typing import Any
 
 import yaml
 
+from sparsestreet.files import read_yaml
 from sparsestreet.naming import nearest, one_line
-from sparsestreet.safe_yaml import read_yaml
 from sparsestreet.scene.edits.edits import REMOVED, Added, Edits, found, objects_of
 from sparsestreet.scene.edits.nodes import Change
 from sparsestreet.scene.edits.paths import AsRecorded, Driven, Held, Moved, Path

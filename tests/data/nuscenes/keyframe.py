@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
-from sparsestreet.safe_pickle import read_pickled
+from sparsestreet.pickles import read_pickled
 from tests.data.nuscenes.written import TABLES, Tables, Written, placed, token
 
 

@@ -12,10 +12,10 @@ import pytest
 
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.waymo import WaymoReader
-from sparsestreet.data.waymo.v1.crc32c import masked_crc32c
-from sparsestreet.data.waymo.v1.records import Records
+from sparsestreet.data.waymo.v1.records import Records, masked_crc32c
 from sparsestreet.data.waymo.v1.segment import RecordSegment
 from tests.conftest import unchecked
+from tests.data.damage import daily
 from tests.data.waymo import records
 from tests.data.waymo.drive import Drive, encoded
 from tests.data.waymo.messages import edited
@@ -117,7 +117,9 @@ FIELDS = {
 }
 
 
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize(
+    "name", daily(FIELDS, "pose of bytes", "pose with NaN", "image of another size", "bomb", "torn range image")
+)
 def test_a_damaged_field(name, messages, tmp_path):
     change, said = FIELDS[name]
     path = records.write(tmp_path / "segment-1.tfrecord", change(messages))
@@ -152,7 +154,7 @@ FILES = {
 }
 
 
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", daily(FILES, "cut in a record", "text", "a flipped bit of an image"))
 def test_a_damaged_file(name, messages, tmp_path):
     change, said = FILES[name]
     path = records.write(tmp_path / "segment-1.tfrecord", messages)

@@ -5,10 +5,11 @@ import mmap
 import struct
 from pathlib import Path
 
+import google_crc32c
+
 from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import Problem, fault
 from sparsestreet.data.waymo.segment import REMEDY
-from sparsestreet.data.waymo.v1.crc32c import masked_crc32c
 
 _HEADER, _FOOTER = 12, 4
 _MOST_RECORDS = 2_000
@@ -73,3 +74,13 @@ class Records:
         if self._bytes[:2] == _GZIP:
             return "the file is packed by gzip: unpack it first"
         return f"the length of {what}, does not have the checksum that is stored with it: this is no TFRecord file"
+
+
+def masked_crc32c(data: bytes | memoryview) -> int:
+    """Return the checksum of a TFRecord: CRC-32C, rotated and offset.
+
+    >>> hex(masked_crc32c(b"123456789"))  # the CRC is 0xe3069283
+    '0xc78ab0e5'
+    """
+    crc = google_crc32c.value(bytes(data))
+    return ((crc >> 15 | crc << 17) + 0xA282EAD8) & 0xFFFFFFFF

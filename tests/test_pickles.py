@@ -16,7 +16,7 @@ import scipy.sparse
 import torch
 from torch._utils import _rebuild_tensor_v2
 
-from sparsestreet.safe_pickle import read_pickled
+from sparsestreet.pickles import read_pickled
 
 ARRAYS = {
     "double": np.linspace(0, 1, 12).reshape(2, 3, 2),
@@ -156,4 +156,22 @@ def test_what_is_no_pickle_or_cut_short(content, tmp_path):
     path = tmp_path / "broken.pkl"
     path.write_bytes(content)
     with pytest.raises(ValueError, match="must be a pickle"):
+        read_pickled(path)
+
+
+class TypeOf:
+    """An array's type by a name that no array of numbers has."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def __reduce__(self):
+        return np.dtype, (self.name, False, True)
+
+
+@pytest.mark.parametrize("name", ["f4,O", "f8,f8", "O"])
+def test_a_type_of_several_fields_is_no_type_of_numbers(name, tmp_path):
+    path = tmp_path / "types.pkl"
+    path.write_bytes(pickle.dumps(TypeOf(name), 2))
+    with pytest.raises(ValueError, match=rf"it holds an array of '{name}', not of numbers"):
         read_pickled(path)
