@@ -53,7 +53,7 @@ class DrivingLog:
 
     name: str
     frames: Frames
-    """Ordered by (frame_index, camera_index), decoded when indexed; ``Frames.of`` takes frames that are in memory."""
+    """Ordered by (frame_index, camera_index), decoded when indexed; ``as_frames`` takes frames that are in memory."""
     sweeps: Sweeps
     """Ordered by index, read when indexed; ``Sweeps.of(())`` where the log has no lidar."""
     tracks: tuple[Track, ...]

@@ -20,6 +20,7 @@ from sparsestreet.data.doubts import doubts
 from sparsestreet.data.ego import check_used
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene, help_to_evaluate
+from sparsestreet.evidence.light import light_doubts, measured_light
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.pictures.effects import draw_effects
 from sparsestreet.pictures.history import draw_history
@@ -177,8 +178,9 @@ def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
     for note in data.driving_log.notes:
         log.info(note)
     with stage("initialize"):
-        check_used(data.split.train, data.driving_log.name)
-        for doubt in doubts(data.driving_log, data.split.train):
+        train = data.split.train
+        check_used(train, data.driving_log.name)
+        for doubt in (*doubts(data.driving_log, train), *light_doubts(measured_light(train))):
             log.warning(doubt)
         return recipe.build(data, plan)
 
