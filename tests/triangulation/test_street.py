@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
-from sparsestreet.data.synthetic.parts import BACKGROUND
+from sparsestreet.data.synthetic.tracer import BACKGROUND
 from sparsestreet.geometry.lenses import distort
 from sparsestreet.triangulation import ImagePointSettings, street_points
 from sparsestreet.triangulation.features import Features

@@ -13,8 +13,7 @@
 """
 
 from sparsestreet.data.synthetic.reader import StreetReader
-from sparsestreet.data.synthetic.sensor import LidarSensor
-from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.settings import LidarSensor, StreetSettings
 from sparsestreet.data.synthetic.street import make_street
 
 __all__ = ["LidarSensor", "StreetReader", "StreetSettings", "make_street"]

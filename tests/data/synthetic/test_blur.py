@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.cameras import street_camera
-from sparsestreet.data.synthetic.declared import with_declared, write_declared
-from sparsestreet.data.synthetic.instant import Instant
+from sparsestreet.data.synthetic.capture import Instant, street_camera, to_srgb
 from sparsestreet.data.synthetic.render import render_frame, render_image
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
-from sparsestreet.data.synthetic.shading import to_srgb
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
+from sparsestreet.data.synthetic.street import with_declared, write_declared
 from sparsestreet.data.synthetic.world import build_world
 from tests.conftest import unchecked
 from tests.typed import there

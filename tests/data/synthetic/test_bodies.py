@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.bodies import joint_rotations
-from sparsestreet.data.synthetic.models.people import Clothes, Pedestrian
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.models import Clothes, Pedestrian
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
+from sparsestreet.data.synthetic.street import joint_rotations
 from sparsestreet.data.synthetic.world import build_world
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import HEIGHT, JOINTS, posed_bones, rest_joints

@@ -10,9 +10,9 @@ from PIL import Image
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings, make_street
-from sparsestreet.data.synthetic.cameras import street_camera
+from sparsestreet.data.synthetic.capture import street_camera
 from sparsestreet.data.synthetic.render import Instant, render_image
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from sparsestreet.data.synthetic.world import World, build_world
 from tests.conftest import unchecked
 from tests.typed import there

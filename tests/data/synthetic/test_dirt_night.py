@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from sparsestreet.data.synthetic import StreetSettings
-from sparsestreet.data.synthetic.dirt import behind_dirt, dirt_opacity
-from sparsestreet.data.synthetic.instant import Sight
-from sparsestreet.data.synthetic.night import at_night
+from sparsestreet.data.synthetic.capture import Sight
+from sparsestreet.data.synthetic.render import at_night, behind_dirt, dirt_opacity
 from sparsestreet.data.synthetic.street import street_name
 from tests.typed import there
 

@@ -11,9 +11,9 @@ from PIL.JpegImagePlugin import JpegImageFile
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.exposure import recorded_gains
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
-from sparsestreet.data.synthetic.truth import street_truth
+from sparsestreet.data.synthetic.reader import street_truth
+from sparsestreet.data.synthetic.render import recorded_gains
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from tests.conftest import unchecked
 from tests.typed import there
 

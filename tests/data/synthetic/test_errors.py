@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from sparsestreet.data.synthetic import StreetSettings, make_street
-from sparsestreet.data.synthetic.cameras import street_camera
-from sparsestreet.data.synthetic.errors import noisy_box, noisy_camera
-from sparsestreet.data.synthetic.parts import at
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.capture import street_camera
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
+from sparsestreet.data.synthetic.street import noisy_box, noisy_camera
+from sparsestreet.data.synthetic.tracer import at
 from sparsestreet.data.synthetic.world import build_world
 from tests.conftest import unchecked
 

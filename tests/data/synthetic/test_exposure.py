@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.exposure import exposure_walk, recorded_gains
-from sparsestreet.data.synthetic.render import render_frame
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
-from sparsestreet.data.synthetic.shading import to_srgb
+from sparsestreet.data.synthetic.capture import to_srgb
+from sparsestreet.data.synthetic.render import exposure_walk, recorded_gains, render_frame
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from sparsestreet.data.synthetic.world import build_world
 from tests.conftest import unchecked
 from tests.typed import there

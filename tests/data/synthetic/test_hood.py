@@ -8,9 +8,8 @@ import pytest
 from PIL import Image
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings, make_street
-from sparsestreet.data.synthetic.hood import hood_coverage
-from sparsestreet.data.synthetic.render import render_frame
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.render import hood_coverage, render_frame
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from sparsestreet.data.synthetic.world import build_world
 from tests.conftest import unchecked
 from tests.typed import there

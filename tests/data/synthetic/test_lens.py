@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sparsestreet.data.synthetic import StreetReader, StreetSettings, cameras, make_street
-from sparsestreet.data.synthetic.cameras import StreetCamera, street_camera
+from sparsestreet.data.synthetic import StreetReader, StreetSettings, capture, make_street
+from sparsestreet.data.synthetic.capture import StreetCamera, street_camera
 from sparsestreet.data.synthetic.render import Instant, render_image
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from sparsestreet.data.synthetic.tracer import _bounding_planes
 from sparsestreet.data.synthetic.world import build_world
 
@@ -90,7 +90,7 @@ def test_files_of_a_street_say_its_lens_and_show_it(tmp_path):
 def test_frames_share_the_rays_of_a_lens(monkeypatch):
     first = street_camera(SETTINGS, 0, np.eye(4))
     ahead = first.rays(1)
-    monkeypatch.setattr(cameras, "undistort", None)
+    monkeypatch.setattr(capture, "undistort", None)
     turn = np.array([[0.0, -1, 0, 5], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     turned = street_camera(SETTINGS, 0, turn).rays(1)
     np.testing.assert_allclose(

@@ -10,11 +10,10 @@ from hydra.utils import instantiate
 
 from sparsestreet.cli.config.compose import configuration
 from sparsestreet.data.synthetic import LidarSensor, StreetReader, StreetSettings
-from sparsestreet.data.synthetic.lidar import StreetSweep, sweep
-from sparsestreet.data.synthetic.parts import Part, at
-from sparsestreet.data.synthetic.scene import Scene
+from sparsestreet.data.synthetic.render import StreetSweep, sweep
 from sparsestreet.data.synthetic.shapes import box
-from sparsestreet.data.synthetic.textures.plain import Plain
+from sparsestreet.data.synthetic.textures import Plain
+from sparsestreet.data.synthetic.tracer import Part, Scene, at
 
 GRAY = Plain((0.5, 0.5, 0.5))
 HALF = 20.0

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from sparsestreet.data.synthetic.world import Actor, build_world
 from sparsestreet.geometry.cameras import project
 

@@ -11,11 +11,10 @@ from PIL import Image
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.motion import PosePath
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.cameras import street_camera
-from sparsestreet.data.synthetic.declared import with_declared, write_declared
-from sparsestreet.data.synthetic.instant import Instant
+from sparsestreet.data.synthetic.capture import Instant, street_camera
 from sparsestreet.data.synthetic.render import render_frame, render_image
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
+from sparsestreet.data.synthetic.street import with_declared, write_declared
 from sparsestreet.data.synthetic.world import build_world
 from tests.conftest import unchecked
 from tests.typed import there

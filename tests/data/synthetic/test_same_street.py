@@ -7,12 +7,10 @@ file, takes its numbers over, and measures anew what docs/ says of streets.
 import numpy as np
 import pytest
 
-from sparsestreet.data.synthetic.cameras import street_camera
-from sparsestreet.data.synthetic.parts import Part
+from sparsestreet.data.synthetic.capture import radiance, street_camera
 from sparsestreet.data.synthetic.render import Instant
 from sparsestreet.data.synthetic.settings import StreetSettings
-from sparsestreet.data.synthetic.shading import radiance
-from sparsestreet.data.synthetic.tracer import NOTHING, Rays, first_hits
+from sparsestreet.data.synthetic.tracer import NOTHING, Part, Rays, first_hits
 from sparsestreet.data.synthetic.world import World, build_world
 
 SETTINGS = StreetSettings(seed=0, num_frames=2)

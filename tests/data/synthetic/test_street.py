@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
-from sparsestreet.data.synthetic.settings import StreetSettings
+from sparsestreet.data.synthetic.settings import WAYMO_TOP, StreetSettings
 from sparsestreet.data.synthetic.street import make_street
 from sparsestreet.data.synthetic.world import build_world
 

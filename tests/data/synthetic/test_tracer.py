@@ -3,13 +3,10 @@
 import numpy as np
 import pytest
 
-from sparsestreet.data.synthetic.parts import Part, at, limb
-from sparsestreet.data.synthetic.scene import Scene, SunView
-from sparsestreet.data.synthetic.shading import radiance, to_srgb
+from sparsestreet.data.synthetic.capture import radiance, to_srgb
 from sparsestreet.data.synthetic.shapes import Capsule, Cylinder, Ellipsoid, box
-from sparsestreet.data.synthetic.sky import random_weather
-from sparsestreet.data.synthetic.textures.plain import Plain
-from sparsestreet.data.synthetic.tracer import NOTHING, Rays, first_hits, sunlit
+from sparsestreet.data.synthetic.textures import Plain, random_weather
+from sparsestreet.data.synthetic.tracer import NOTHING, Part, Rays, Scene, SunView, at, first_hits, limb, sunlit
 from tests.typed import as_a
 
 GRAY = Plain((0.5, 0.5, 0.5))

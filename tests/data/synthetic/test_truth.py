@@ -8,14 +8,12 @@ import torch
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.cameras import StreetCamera
-from sparsestreet.data.synthetic.parts import Part, at
+from sparsestreet.data.synthetic.capture import StreetCamera
 from sparsestreet.data.synthetic.render import Instant, render_frame
-from sparsestreet.data.synthetic.scene import Scene, SunView
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from sparsestreet.data.synthetic.shapes import box
-from sparsestreet.data.synthetic.sky import random_weather
-from sparsestreet.data.synthetic.textures.plain import Plain
+from sparsestreet.data.synthetic.textures import Plain, random_weather
+from sparsestreet.data.synthetic.tracer import Part, Scene, SunView, at
 from sparsestreet.data.synthetic.world import build_world
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import View

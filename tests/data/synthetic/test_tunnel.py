@@ -7,7 +7,7 @@ import pytest
 
 from sparsestreet.data.synthetic import StreetSettings
 from sparsestreet.data.synthetic.render import Instant, render_frame
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from sparsestreet.data.synthetic.tracer import Rays, first_hits, sunlit
 from sparsestreet.data.synthetic.world import World, build_world
 from tests.conftest import unchecked

@@ -5,12 +5,10 @@ import itertools
 import numpy as np
 import pytest
 
-from sparsestreet.data.synthetic import layout
-from sparsestreet.data.synthetic.models.car import STYLES, Car
-from sparsestreet.data.synthetic.models.people import Cyclist, Pedestrian, random_clothes
-from sparsestreet.data.synthetic.motion import EgoDrive, Path
+from sparsestreet.data.synthetic import world as layout
+from sparsestreet.data.synthetic.models import STYLES, Car, Cyclist, Pedestrian, random_clothes
 from sparsestreet.data.synthetic.settings import StreetSettings
-from sparsestreet.data.synthetic.world import build_world
+from sparsestreet.data.synthetic.world import EgoDrive, Path, build_world
 
 CLOTHES = random_clothes(np.random.default_rng(0))
 GRAY = (0.5, 0.5, 0.5)
