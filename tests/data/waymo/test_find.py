@@ -4,7 +4,7 @@ import pytest
 
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.waymo import WaymoReader
-from sparsestreet.data.waymo.find import find_segments
+from sparsestreet.data.waymo.reader import find_segments
 from tests.data.waymo import records
 from tests.data.waymo.drive import Drive
 

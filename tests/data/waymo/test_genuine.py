@@ -7,10 +7,9 @@ import pytest
 
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.waymo import WaymoReader
-from sparsestreet.data.waymo.images import middle, readout
+from sparsestreet.data.waymo.boxes import middle, readout
 from sparsestreet.data.waymo.v1.segment import RecordSegment
-from sparsestreet.data.waymo.v2.components import matrix
-from sparsestreet.data.waymo.v2.tables import FRAME, SEGMENT, Table
+from sparsestreet.data.waymo.v2 import FRAME, SEGMENT, Table, matrix
 
 ALL = ["FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT"]
 SIZES = [(1920, 1280)] * 3 + [(1920, 886)] * 2
