@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sparsestreet.data.nuscenes.instants import find_instants
-from sparsestreet.data.nuscenes.scene import LIDAR, DataFile, SceneFiles
-from sparsestreet.data.nuscenes.tables import Row
+from sparsestreet.data.nuscenes.selection import find_instants
+from sparsestreet.data.nuscenes.tables import LIDAR, DataFile, Row, SceneFiles
 
 MS = 1_000_000
 OFFSETS = {
