@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from sparsestreet.data.kitti import KittiReader
-from sparsestreet.data.kitti.calibration import read_calibration
-from sparsestreet.data.kitti.velodyne import OWN_CAR
+from sparsestreet.data.kitti.files import OWN_CAR, read_calibration
 from sparsestreet.geometry.cameras import inverse
 from tests.data.kitti.write import DATE, DRIVE, RECTIFIED_PLACES, write_kitti
 from tests.data.plan import Plan

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from sparsestreet.data.kitti import KittiReader
-from sparsestreet.data.kitti.velodyne import point_stamps
+from sparsestreet.data.kitti.files import point_stamps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import Recording
 from sparsestreet.geometry.cameras import inverse, transform_points

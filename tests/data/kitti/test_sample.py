@@ -11,9 +11,8 @@ from torch import Tensor
 
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.kitti import KittiReader
-from sparsestreet.data.kitti.oxts import read_oxts
-from sparsestreet.data.kitti.tracklets import Tracklet, read_tracklets
-from sparsestreet.data.kitti.velodyne import point_stamps, read_points
+from sparsestreet.data.kitti.files import point_stamps, read_points
+from sparsestreet.data.kitti.reader import Tracklet, read_oxts, read_tracklets
 from sparsestreet.data.motion import untwisted
 from sparsestreet.data.recording import Recording
 from sparsestreet.geometry.cameras import inverse, transform_points

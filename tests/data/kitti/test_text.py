@@ -2,7 +2,7 @@
 
 import pytest
 
-from sparsestreet.data.kitti.text import read_stamps
+from sparsestreet.data.kitti.files import read_stamps
 
 
 @pytest.mark.parametrize(
