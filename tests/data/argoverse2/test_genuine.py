@@ -8,8 +8,15 @@ import pytest
 import torch
 
 from sparsestreet.data.argoverse2 import Argoverse2Reader
-from sparsestreet.data.argoverse2.layout import Layout, find_log, stamped_files
-from sparsestreet.data.argoverse2.tables import read_boxes, read_cameras, read_path, read_sweep
+from sparsestreet.data.argoverse2.reader import (
+    Layout,
+    find_log,
+    read_boxes,
+    read_cameras,
+    read_path,
+    read_sweep,
+    stamped_files,
+)
 from sparsestreet.data.problems import LogError
 
 pytest.importorskip("pyarrow", reason="feather files need pyarrow")
