@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
+from sparsestreet.data.drivestudio.annotations import role_of
 from sparsestreet.data.fingerprint import LogFiles, hash_files
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogReader
-from sparsestreet.data.roles import role_of
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
 
 CONF = Path(__file__).parents[2] / "conf"

@@ -18,9 +18,9 @@ from PIL import Image
 
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
+from sparsestreet.data.drivestudio.annotations import role_of
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog, VehiclePath
-from sparsestreet.data.roles import role_of
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.types import BodyPoses, Camera, Frame, Shutter, SparsePoints, Sweep, Track
 from tests.data.plan import Plan, moved, pose, turned

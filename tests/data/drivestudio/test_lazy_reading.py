@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import ImageFile
 
-from sparsestreet.data.drivestudio import DriveStudioReader, frames
+from sparsestreet.data.drivestudio import DriveStudioReader, contents
 from sparsestreet.data.log import split
 from sparsestreet.types import Frame, Sweep
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo, write_image
@@ -28,8 +28,8 @@ def decoded(monkeypatch) -> Counter[str]:
         counts[path.stem] += 1
         return read_image(path, *arguments)
 
-    read_image = frames.read_image
-    monkeypatch.setattr(frames, "read_image", count)
+    read_image = contents.read_image
+    monkeypatch.setattr(contents, "read_image", count)
     return counts
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from sparsestreet.cli.config.compose import CONF
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
-from sparsestreet.data.drivestudio.classes import KNOWN, class_in
+from sparsestreet.data.drivestudio.annotations import KNOWN, class_in
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader

@@ -7,7 +7,7 @@ import torch
 
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
-from sparsestreet.data.drivestudio.classes import class_in
+from sparsestreet.data.drivestudio.annotations import class_in
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
 from tests.data.same_log import check_same_masks, check_same_sweeps, check_same_track, check_same_views
