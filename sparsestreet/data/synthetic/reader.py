@@ -1,4 +1,4 @@
-"""The built-in default log: a street that is made when it is first needed, and read like any other log."""
+"""Read the embedded street, which is made when it is first needed, and its exact truth."""
 
 import logging
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Renders one frame of the street: pictures, exact truth per pixel, and the lidar's turn."""
+"""Render one frame of the street: pictures, exact truth per pixel, and the lidar's turn."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

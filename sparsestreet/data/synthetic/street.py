@@ -1,4 +1,4 @@
-"""Makes a street: renders and writes all frames, or nothing."""
+"""Make a street on disk: render and write all frames with their errors of poses, or nothing."""
 
 import dataclasses
 import hashlib

@@ -8,10 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from sparsestreet.data.synthetic.shapes import Polytope
+from sparsestreet.data.synthetic.shapes import Polytope, Scalars, Vectors
 
-Vectors = Float32[np.ndarray, "3 n"]
-Scalars = Float32[np.ndarray, " n"]
 Color = tuple[float, float, float]
 """Linear RGB reflectance in [0, 1]."""
 

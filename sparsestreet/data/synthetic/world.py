@@ -1,4 +1,4 @@
-"""The street itself: the places and motions of all things, decided by the seed."""
+"""Build the street: places and motions of all things, decided by the seed."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

@@ -5,10 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from sparsestreet.data.synthetic import world as layout
 from sparsestreet.data.synthetic.models import STYLES, Car, Cyclist, Pedestrian, random_clothes
 from sparsestreet.data.synthetic.settings import StreetSettings
-from sparsestreet.data.synthetic.world import EgoDrive, Path, build_world
+from sparsestreet.data.synthetic.world import CURB_HEIGHT, CURB_LEFT, CURB_RIGHT, LANES, EgoDrive, Path, build_world
 
 CLOTHES = random_clothes(np.random.default_rng(0))
 GRAY = (0.5, 0.5, 0.5)
@@ -120,10 +119,10 @@ def test_people_walk_on_footways_and_cars_on_the_road():
     world = build_world(StreetSettings(seed=5))
     for actor in world.actors:
         y = actor.pose(1.0)[1, 3]
-        on_road = layout.CURB_RIGHT < y < layout.CURB_LEFT
+        on_road = CURB_RIGHT < y < CURB_LEFT
         assert on_road == (actor.model.class_name != "Pedestrian")
         bottom = actor.pose(1.0)[2, 3] - actor.model.size[2] / 2
-        assert bottom == pytest.approx(0.0 if on_road else layout.CURB_HEIGHT, abs=1e-9)
+        assert bottom == pytest.approx(0.0 if on_road else CURB_HEIGHT, abs=1e-9)
 
 
 def test_a_crowd_crosses_close_before_the_car_and_waits_beside_the_lanes():
@@ -140,8 +139,8 @@ def test_a_crowd_crosses_close_before_the_car_and_waits_beside_the_lanes():
         # 0.05 m take a walker of 0.9 m/s 0.06 s, in which the car drives half a meter.
         assert middle.any()
         assert 5.4 < ahead.min() <= ahead.max() < 10.6
-        assert layout.LANES[0] - 1e-9 <= y.min()
-        assert y.max() <= layout.LANES[1] + 1e-9
+        assert LANES[0] - 1e-9 <= y.min()
+        assert y.max() <= LANES[1] + 1e-9
         steps = np.abs(np.diff(y)) * 600 / settings.duration
         walks = steps > 1e-6
         assert 0.8 < np.median(steps[walks]) < 1.7
