@@ -58,7 +58,7 @@ class Light:
         }
 
 
-def light_doubts(light: Light) -> Iterator[str]:
+def light_warnings(light: Light) -> Iterator[str]:
     """Yield one sentence for each thing about the light that no scene simulates."""
     if light.stops >= MIN_STOPS:
         yield (

@@ -16,11 +16,11 @@ from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.loggers import CSVLogger, Logger
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.doubts import doubts
-from sparsestreet.data.ego import check_used
+from sparsestreet.data.hood import check_used
+from sparsestreet.data.log_warnings import log_warnings
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene, help_to_evaluate
-from sparsestreet.evidence.light import light_doubts, measured_light
+from sparsestreet.evidence.light import light_warnings, measured_light
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.pictures.effects import draw_effects
 from sparsestreet.pictures.history import draw_history
@@ -180,7 +180,7 @@ def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
     with stage("initialize"):
         train = data.split.train
         check_used(train, data.driving_log.name)
-        for doubt in (*doubts(data.driving_log, train), *light_doubts(measured_light(train))):
+        for doubt in (*log_warnings(data.driving_log, train), *light_warnings(measured_light(train))):
             log.warning(doubt)
         return recipe.build(data, plan)
 

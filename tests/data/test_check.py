@@ -12,7 +12,7 @@ from rich.console import Console
 
 from sparsestreet.data.check import report_check
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.ego import check_used
+from sparsestreet.data.hood import check_used
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import split
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo

@@ -7,10 +7,10 @@ from fractions import Fraction
 import pytest
 import torch
 
-from sparsestreet.data.clock import LogClock, read_stamps
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
+from sparsestreet.data.timestamps import LogClock, read_stamps
 from sparsestreet.types import Frame, Shutter, View
 from tests.data.streets import make_log
 from tests.typed import there

@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.data.contradictions import contradictions
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog, VehiclePath
+from sparsestreet.data.log_warnings import contradictions
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Camera, Frame, SparsePoints, Sweep, Track

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.dirt import find_dirt
+from sparsestreet.data.hood import find_dirt
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.effects import DirtSettings

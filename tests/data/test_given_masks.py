@@ -7,9 +7,9 @@ import pytest
 import torch
 from PIL import Image
 
-from sparsestreet.data.given_masks import GivenMasks
+from sparsestreet.data.images import GivenMasks
 from sparsestreet.data.problems import LogError
-from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.data.rig import Undistortion
 from sparsestreet.geometry.lenses import Fisheye
 
 SIZES = {"recorded_size": (8, 4), "size": (8, 4)}

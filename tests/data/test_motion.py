@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation, Slerp
 
-from sparsestreet.data.motion import PosePath, untwisted
+from sparsestreet.data.poses import PosePath, untwisted
 from sparsestreet.geometry.cameras import inverse, transform_points
 from tests.conftest import unchecked
 

@@ -8,10 +8,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from sparsestreet.data.drivestudio.annotations import role_of
-from sparsestreet.data.fingerprint import LogFiles, hash_files
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
-from sparsestreet.data.reader import LogReader
+from sparsestreet.data.reader import LogFiles, LogReader, hash_files
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
 
 CONF = Path(__file__).parents[2] / "conf"

@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.data.doubts import doubts
+from sparsestreet.data.log_warnings import log_warnings
 from sparsestreet.data.problems import fault
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera
@@ -91,7 +91,7 @@ def test_points_that_are_not_finite_are_left_out_and_gray_ones_are_told(broken):
     )
     log = log_of(recording, cache_bytes=0, check=list)
     assert there(log.sparse_points)().positions.tolist() == [[0.0, 1.0, 5.0]] * 3
-    lost, gray = doubts(replace(log, frames=log.frames[:0]))
+    lost, gray = log_warnings(replace(log, frames=log.frames[:0]))
     assert lost == "2 of 5 points of cloud.ply are not finite, the first is point 3: left out"
     assert gray.startswith("the points of cloud.ply have no colors that are known")
 

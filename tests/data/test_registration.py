@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Sweeps, as_frames
-from sparsestreet.data.registration import EdgeShift, edge_shift
+from sparsestreet.data.lidar import EdgeShift, edge_shift
 from sparsestreet.types import Camera, Frame, Sweep
 
 FOCAL, WIDTH, HEIGHT = 100.0, 120, 80

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.data.rig import Undistortion
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye, FTheta, Lens, Mei, undistort
 from tests.typed import there
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
-from sparsestreet.evidence.light import light_doubts, measured_light
+from sparsestreet.evidence.light import light_warnings, measured_light
 from sparsestreet.types import Camera, Frame
 
 HEIGHT, WIDTH = 30, 40
@@ -57,13 +57,13 @@ def test_sky_and_car_do_not_count():
 
 @pytest.mark.parametrize(("level", "dark"), [(118, False), (60, False), (30, True), (0, True)])
 def test_dark_images_are_doubted(level: float, dark: bool):
-    said = tuple(light_doubts(measured_light(frames(level))))
+    said = tuple(light_warnings(measured_light(frames(level))))
     assert [f"10 images have a mean gray level of {level} of 255" in line for line in said] == [True] * dark
 
 
 @pytest.mark.parametrize(("white", "clipped"), [(0.0, False), (0.1, False), (0.4, True)])
 def test_clipped_images_are_doubted_and_the_worst_is_named(white: float, clipped: bool):
-    said = tuple(light_doubts(measured_light(frames(90, white=white))))
+    said = tuple(light_warnings(measured_light(frames(90, white=white))))
     assert ["most in frame 9 (40.0 %)" in line for line in said] == [True] * clipped
 
 

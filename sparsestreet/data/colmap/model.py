@@ -16,7 +16,7 @@ from torch import Tensor
 from sparsestreet.atomic import check_regular
 from sparsestreet.data.posed_images import PosedImage
 from sparsestreet.data.problems import LogError, attempt, fault
-from sparsestreet.data.window import listed
+from sparsestreet.data.reader import listed
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye, Lens, Rational

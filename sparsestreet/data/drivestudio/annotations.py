@@ -13,8 +13,7 @@ from torch import Tensor
 from sparsestreet.data.drivestudio.bodies import blank_person, pickled_people, set_pose
 from sparsestreet.data.drivestudio.layout import FLAVORS, UPRIGHT, Flavor
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.data.motion import PosePath
-from sparsestreet.data.poses import AHEAD_FROM_OPENCV
+from sparsestreet.data.poses import AHEAD_FROM_OPENCV, PosePath
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import BodyPoses, Track, View

@@ -13,9 +13,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.clock import LogClock, read_stamps
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, NAME_IT, Layout, read_numbers
-from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.images import (
     image_notes,
     image_size,
@@ -28,7 +26,9 @@ from sparsestreet.data.json_tree import unique
 from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.poses import AHEAD_FROM_OPENCV, check_rigid, recentered
 from sparsestreet.data.problems import LogError, Problem, fault, missing_files
+from sparsestreet.data.reader import LogFiles
 from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.data.timestamps import LogClock, read_stamps
 from sparsestreet.data.tracks import checked_track
 from sparsestreet.geometry.cameras import transform_points
 from sparsestreet.types import Frame, Track, View

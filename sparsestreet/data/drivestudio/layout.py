@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from sparsestreet.data.problems import LogError, fault
-from sparsestreet.data.window import chosen_cameras, frame_window, listed
+from sparsestreet.data.reader import chosen_cameras, frame_window, listed
 
 
 def read_numbers(path: Path) -> Float64[np.ndarray, "rows columns"]:

@@ -32,18 +32,14 @@ from sparsestreet.data.drivestudio.contents import (
     sweep_notes,
 )
 from sparsestreet.data.drivestudio.layout import MASK_KINDS, FlavorName, Layout, find_layout
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.frame_cache import CacheSize, cache_bytes
 from sparsestreet.data.images import check_camera_images, image_size
-from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.notes import absence_notes
-from sparsestreet.data.poses import dataset_from_world, recentered
+from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath, absence_notes
+from sparsestreet.data.poses import check_extent, dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_files, missing_notes
-from sparsestreet.data.reader import LogReader
+from sparsestreet.data.reader import FolderSignature, LogFiles, LogReader
+from sparsestreet.data.recording import SceneFolder
 from sparsestreet.data.rig import check_lens
-from sparsestreet.data.scene_folder import SceneFolder
 from sparsestreet.data.tracks import timed_tracks, track_in_window
 from sparsestreet.types import Track
 
@@ -141,7 +137,7 @@ class DriveStudioReader(LogReader):
     the images of camera C, where each has a pose of its own.
     """
 
-    marks = Marks(("images/[0-9][0-9][0-9]_[0-9].jpg", "extrinsics/*.txt"))
+    marks = FolderSignature(("images/[0-9][0-9][0-9]_[0-9].jpg", "extrinsics/*.txt"))
 
     root: Path | str
     cameras: Sequence[int] | None = None

@@ -32,7 +32,7 @@ from sparsestreet.data.drivestudio.annotations import (
     written_tracks,
 )
 from sparsestreet.data.drivestudio.layout import EGO_MASKS, FINE_MASKS, SKY_MASKS, Layout
-from sparsestreet.data.encoded import jpeg, mask_png, number_lines, png
+from sparsestreet.data.images import jpeg, mask_png, number_lines, png
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.poses import AHEAD_FROM_OPENCV

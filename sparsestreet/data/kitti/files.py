@@ -2,26 +2,28 @@
 
 import calendar
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median_low
+from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
 import torch
+from defusedxml import DefusedXmlException
+from defusedxml.ElementTree import iterparse
 from jaxtyping import Bool, Float64, Int64, UInt8
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import image_size, read_image
+from sparsestreet.data.images import GivenMasks, image_size, read_image
 from sparsestreet.data.lidar import check_points
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
+from sparsestreet.data.reader import chosen_cameras, frame_window, listed
 from sparsestreet.data.recording import RecordedImage, Recording
 from sparsestreet.data.rig import RigCamera
-from sparsestreet.data.window import chosen_cameras, frame_window, listed
 from sparsestreet.geometry.cameras import inverse
 
 _MAX_TEXT_BYTES = 1 << 26
@@ -441,3 +443,40 @@ def check_recording(recording: Recording) -> list[Problem]:
     for sweep in (recording.sweeps or {}).values():
         attempt(problems, sweep.read)
     return problems
+
+
+_MAX_DEPTH = 64
+
+
+def elements(path: Path, depth: int, *, max_bytes: int, remedy: str) -> Iterator[Element]:
+    """Yield the elements at a depth, the root's being 0; each is emptied once the next is asked for.
+
+    A document may name its type, as boost's archives do. It may not declare entities or refer to other files.
+
+    Args:
+        path: of the document.
+        depth: of the elements.
+        max_bytes: size of a file above which it is refused.
+        remedy: what to do about a document that cannot be read.
+
+    Raises LogError for a file that is missing, too large, or no such document.
+    """
+    try:
+        check_regular(path)
+        if (size := path.stat().st_size) > max_bytes:
+            raise fault(path, f"the file has {size} bytes, more than the {max_bytes} that are read", remedy)
+        level = -1
+        for event, element in iterparse(str(path), ("start", "end"), forbid_dtd=False):
+            level += 1 if event == "start" else 0
+            if level > _MAX_DEPTH:
+                raise fault(path, f"elements lie more than {_MAX_DEPTH} deep", remedy)
+            if event == "end":
+                if level == depth:
+                    yield element
+                if level <= depth:
+                    element.clear()
+                level -= 1
+    except OSError as error:
+        raise fault(path, f"the file cannot be read ({error})", remedy) from error
+    except (DefusedXmlException, ParseError, LookupError) as error:
+        raise fault(path, f"the file is no XML that can be read ({error})", remedy) from error

@@ -12,9 +12,7 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
+from sparsestreet.data.images import GivenMasks
 from sparsestreet.data.kitti.files import (
     GRAY,
     Calibration,
@@ -22,6 +20,7 @@ from sparsestreet.data.kitti.files import (
     DriveClock,
     Pixels,
     check_recording,
+    elements,
     find_drive,
     numbers,
     point_stamps,
@@ -31,11 +30,10 @@ from sparsestreet.data.kitti.files import (
     read_points,
     read_turns,
 )
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import PosePath, untwisted
+from sparsestreet.data.poses import PosePath, check_extent, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
-from sparsestreet.data.safe_xml import elements
 from sparsestreet.geometry.cameras import transform_points
 
 EARTH_RADIUS = 6378137.0
@@ -233,7 +231,7 @@ class KittiReader(RecordedReader):
     faced forward, which triggered all four cameras. The world is Mercator's plane: x east, y north, z up.
     """
 
-    marks = Marks(("????_??_??/*_drive_*_sync", "????_??_??/*_drive_*_extract"))
+    marks = FolderSignature(("????_??_??/*_drive_*_sync", "????_??_??/*_drive_*_extract"))
 
     drive: str | int | None = None
     """Such as 2011_09_26_drive_0001; None: the only one."""

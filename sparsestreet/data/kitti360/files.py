@@ -13,6 +13,7 @@ from torch import Tensor
 
 from sparsestreet.data.kitti.files import (
     RectifiedCamera,
+    elements,
     keyed_numbers,
     numbers,
     read_keyed,
@@ -23,10 +24,9 @@ from sparsestreet.data.kitti.files import (
 )
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
+from sparsestreet.data.reader import chosen_cameras, listed
 from sparsestreet.data.recording import Boxes
 from sparsestreet.data.rig import check_lens_camera
-from sparsestreet.data.safe_xml import elements
-from sparsestreet.data.window import chosen_cameras, listed
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.lenses import Mei
 

@@ -13,9 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
+from sparsestreet.data.images import GivenMasks
 from sparsestreet.data.kitti.files import (
     Masks,
     Pixels,
@@ -38,10 +36,9 @@ from sparsestreet.data.kitti360.files import (
     read_calibration,
     read_poses,
 )
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import PosePath, untwisted
-from sparsestreet.data.poses import RIGIDITY_TOLERANCE, are_rigid
+from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.cameras import rigidity_error, transform_points
@@ -94,7 +91,7 @@ class Kitti360Reader(RecordedReader):
     frame, for which the images' stamps stand. The world is that of the shipped poses.
     """
 
-    marks = Marks(("data_2d_raw/*_drive_*_sync",))
+    marks = FolderSignature(("data_2d_raw/*_drive_*_sync",))
 
     sequence: int | str | None = None
     """0, 2 to 10 or 18; None: the only one."""

@@ -9,13 +9,12 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.images import image_size
 from sparsestreet.data.json_tree import JsonValue, read_json
-from sparsestreet.data.marks import Marks
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.posed_images import PosedImage, PosedImages, check_images, recording_of, sort_images
 from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_notes
+from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recording import RecordedReader, Recording
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye, Lens
 
@@ -185,7 +184,7 @@ class NerfstudioReader(RecordedReader):
     The world is that of the file's poses and points. There are no returns and no boxes.
     """
 
-    marks = Marks(("transforms.json",))
+    marks = FolderSignature(("transforms.json",))
 
     scale: float = 1.0
     """Meters to a unit of the file."""

@@ -15,16 +15,14 @@ from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.ego import bottom_rows
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles, hash_files
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, image_size, read_image
+from sparsestreet.data.hood import bottom_rows
+from sparsestreet.data.images import GivenMasks, check_camera_images, image_size, read_image
 from sparsestreet.data.lidar import check_points
-from sparsestreet.data.marks import Marks
 from sparsestreet.data.nuscenes.selection import Rate, Selection, select
 from sparsestreet.data.nuscenes.tables import LIDAR, DataFile, Row, SceneFiles, all_rows, pose_of, rows_of_tokens
+from sparsestreet.data.poses import check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles, hash_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.geometry.cameras import transform_points
@@ -273,7 +271,7 @@ class NuScenesReader(RecordedReader):
     stamp. Lidar points are where they were at the end of a turn. Boxes are those of the samples, at their stamps.
     """
 
-    marks = Marks(("*/sample_data.json",))
+    marks = FolderSignature(("*/sample_data.json",))
 
     scene: str | int | None = None
     """Its name, as "scene-0061"; or its place in scene.json, from 0, as DriveStudio counts; None: the only one."""

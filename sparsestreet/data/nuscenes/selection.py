@@ -12,7 +12,6 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.motion import PosePath
 from sparsestreet.data.nuscenes.tables import (
     LIDAR,
     REMEDY,
@@ -25,8 +24,9 @@ from sparsestreet.data.nuscenes.tables import (
     rows_of_tokens,
     rows_where,
 )
+from sparsestreet.data.poses import PosePath
 from sparsestreet.data.problems import fault
-from sparsestreet.data.window import chosen_cameras, frame_window, listed
+from sparsestreet.data.reader import chosen_cameras, frame_window, listed
 
 _DIGITS = 4
 """Of the number in a scene's name."""

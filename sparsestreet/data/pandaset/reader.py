@@ -10,12 +10,8 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 
-from sparsestreet.data.ego import bottom_rows
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import image_size, read_image
-from sparsestreet.data.marks import Marks
+from sparsestreet.data.hood import bottom_rows
+from sparsestreet.data.images import GivenMasks, image_size, read_image
 from sparsestreet.data.pandaset.tables import (
     CAMERA_FROM_LIDAR,
     EGO_ROWS,
@@ -31,10 +27,11 @@ from sparsestreet.data.pandaset.tables import (
     read_returns,
     read_stamps,
 )
+from sparsestreet.data.poses import check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
-from sparsestreet.data.window import chosen_cameras, frame_window
 from sparsestreet.geometry.cameras import inverse, transform_points
 
 _SURE = 0.9
@@ -176,7 +173,7 @@ class PandaSetReader(RecordedReader):
     as pinholes whose rows are exposed at once; the data set declares neither lens nor shutter.
     """
 
-    marks = Marks(("camera/front_camera/poses.json",), depth=2)
+    marks = FolderSignature(("camera/front_camera/poses.json",), depth=2)
 
     scene: str | int | None = None
     """Name of the sequence, "001" or 1; None: the only one below the root."""

@@ -17,7 +17,7 @@ from sparsestreet.data.lidar import check_points
 from sparsestreet.data.pandaset.frames import read_columns
 from sparsestreet.data.poses import rigid_poses
 from sparsestreet.data.problems import fault
-from sparsestreet.data.window import listed
+from sparsestreet.data.reader import listed
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import inverse, transform_points
 

@@ -11,14 +11,10 @@ from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, check_image_sizes, read_image, read_mask
+from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_image, read_mask
 from sparsestreet.data.lidar import check_points, empty_notes, returned
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import PosePath, untwisted
 from sparsestreet.data.ply import read_ply
+from sparsestreet.data.poses import PosePath, check_extent, untwisted
 from sparsestreet.data.problems import (
     LogError,
     Missing,
@@ -29,6 +25,7 @@ from sparsestreet.data.problems import (
     missing_files,
     missing_notes,
 )
+from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.rig_json.table import (
@@ -40,7 +37,6 @@ from sparsestreet.data.rig_json.table import (
     read_table,
     with_files,
 )
-from sparsestreet.data.window import chosen_cameras, frame_window
 from sparsestreet.geometry.cameras import transform_points
 from sparsestreet.types import Shutter
 
@@ -274,7 +270,7 @@ def entry_of(shot: RecordedImage) -> ImageEntry:
 class RigJsonReader(RecordedReader):
     """A folder with a ``rig.json`` that somebody wrote by hand (docs/datasets/rig_json.md)."""
 
-    marks = Marks(("rig.json",))
+    marks = FolderSignature(("rig.json",))
 
     pinhole_fov: float | None = None
     """Degrees that the pinhole of a lens that is not simulated sees from left to right; None: its resolution is that of

@@ -19,7 +19,7 @@ from jaxtyping import Float64, Int16
 from scipy.spatial.transform import Rotation
 
 from sparsestreet.data.drivestudio.bodies import blank_person, pickled_people, set_pose
-from sparsestreet.data.encoded import jpeg, mask_png
+from sparsestreet.data.images import jpeg, mask_png
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic.capture import street_camera

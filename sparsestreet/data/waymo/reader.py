@@ -12,22 +12,26 @@ from jaxtyping import Bool, Float64, UInt8
 from PIL import Image
 from torch import Tensor
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import colors
+from sparsestreet.data.images import GivenMasks, colors
 from sparsestreet.data.lidar import check_points
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import PosePath
+from sparsestreet.data.poses import PosePath, check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
+from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import camera_at, middle, read_boxes, shutter
-from sparsestreet.data.waymo.segment import REMEDY, SPIN, ImageMotion, Segment, canonical, check_returns, world_points
-from sparsestreet.data.waymo.spool import Spool
+from sparsestreet.data.waymo.segment import (
+    REMEDY,
+    SPIN,
+    ImageMotion,
+    Segment,
+    Spool,
+    canonical,
+    check_returns,
+    world_points,
+)
 from sparsestreet.data.waymo.v1.segment import RecordSegment
 from sparsestreet.data.waymo.v2 import TableSegment
-from sparsestreet.data.window import chosen_cameras, frame_window, listed
 
 _COMPONENTS = ("vehicle_pose", "camera_image", "camera_calibration", "lidar", "lidar_box")
 _RECORDS = ("*.tfrecord", "*/*.tfrecord", "*/*/*.tfrecord")
@@ -214,7 +218,7 @@ class WaymoReader(RecordedReader):
     the frame is of. Each image has the pose and the stamp of the middle of its readout.
     """
 
-    marks = Marks(("*.tfrecord", "vehicle_pose/*.parquet", "camera_image/*.parquet"), depth=2)
+    marks = FolderSignature(("*.tfrecord", "vehicle_pose/*.parquet", "camera_image/*.parquet"), depth=2)
 
     scene: str | int | None = None
     """Name of a segment, or its place in ``scenes``, from 0; None: the only one."""

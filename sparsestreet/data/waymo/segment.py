@@ -3,20 +3,25 @@
 The vehicle's axes, and a camera's, are x forward, y left, z up. The world is Waymo's global one: east, north, up.
 """
 
+import os
+import tempfile
+import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
-from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.frame_cache import Lock
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import Problem, fault
+from sparsestreet.data.reader import LogFiles
 
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
 LIDARS = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}
@@ -349,3 +354,41 @@ def _turned(angles: Float64[np.ndarray, "n 3"], points: Float64[np.ndarray, "n 3
     y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
     x, z = np.cos(pitch) * x + np.sin(pitch) * z, np.cos(pitch) * z - np.sin(pitch) * x
     return np.stack((np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, z), -1)
+
+
+class Spool:
+    """Bytes by key. They go to the folder for temporary files (TMPDIR), not to memory."""
+
+    def __init__(self) -> None:
+        self._file: BinaryIO | None = None
+        self._places: dict[Hashable, tuple[int, int]] = {}
+        self._end = 0
+        self._lock = Lock()
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._places
+
+    def put(self, key: Hashable, data: bytes) -> None:
+        """Raises LogError where the folder has no room."""
+        try:
+            with self._lock:
+                file = self._opened()
+                start, self._end = self._end, self._end + len(data)
+            done = 0
+            while done < len(data):
+                done += os.pwrite(file.fileno(), data[done:], start + done)
+        except OSError as error:
+            folder, remedy = Path(tempfile.gettempdir()), "make room, or set TMPDIR to a folder with room"
+            raise fault(folder, f"{len(data)} bytes of decoded data cannot be kept here ({error})", remedy) from error
+        self._places[key] = start, len(data)
+
+    def get(self, key: Hashable) -> bytes:
+        start, length = self._places[key]
+        return os.pread(self._opened().fileno(), length, start)
+
+    def _opened(self) -> BinaryIO:
+        if self._file is None:
+            # Open as long as this object lives.
+            self._file = tempfile.TemporaryFile(prefix="sparsestreet-")  # noqa: SIM115
+            weakref.finalize(self, self._file.close)
+        return self._file

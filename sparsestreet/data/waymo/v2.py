@@ -14,9 +14,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.frame_cache import Lock
 from sparsestreet.data.problems import LogError, Problem, fault
+from sparsestreet.data.reader import LogFiles
 from sparsestreet.data.waymo.segment import (
     CAMERAS,
     LIDARS,
@@ -27,6 +27,7 @@ from sparsestreet.data.waymo.segment import (
     LidarCalibration,
     Returns,
     Segment,
+    Spool,
     box_label,
     camera_calibration,
     image_motion,
@@ -34,7 +35,6 @@ from sparsestreet.data.waymo.segment import (
     returns_of,
     transform,
 )
-from sparsestreet.data.waymo.spool import Spool
 
 SEGMENT, FRAME = "key.segment_context_name", "key.frame_timestamp_micros"
 CAMERA, LASER, OBJECT = "key.camera_name", "key.laser_name", "key.laser_object_id"

@@ -8,7 +8,7 @@ import torch
 
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.images import read_image, read_mask
-from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.data.rig import Undistortion
 from sparsestreet.geometry.lenses import BrownConrady
 from sparsestreet.types import Camera
 from tests.conftest import unchecked

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.fingerprint import LogFiles, hash_files
+from sparsestreet.data.reader import LogFiles, hash_files
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 
 FLAVORS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])

@@ -13,7 +13,7 @@ from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.kitti import KittiReader
 from sparsestreet.data.kitti.files import point_stamps, read_points
 from sparsestreet.data.kitti.reader import Tracklet, read_oxts, read_tracklets
-from sparsestreet.data.motion import untwisted
+from sparsestreet.data.poses import untwisted
 from sparsestreet.data.recording import Recording
 from sparsestreet.geometry.cameras import inverse, transform_points
 

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.data.motion import PosePath
+from sparsestreet.data.poses import PosePath
 from sparsestreet.data.synthetic import StreetReader, StreetSettings, capture, make_street
 from sparsestreet.data.synthetic.capture import StreetCamera, street_camera, to_srgb
 from sparsestreet.data.synthetic.render import Instant, render_frame, render_image

@@ -7,8 +7,8 @@ from pathlib import Path
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.problems import Problem, fault
+from sparsestreet.data.reader import LogFiles
 from sparsestreet.data.waymo import segment
 from sparsestreet.data.waymo.segment import (
     CAMERAS,

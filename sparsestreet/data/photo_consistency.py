@@ -27,7 +27,7 @@ _MOVES = 2.0
 
 
 @dataclass(frozen=True)
-class FollowedReturns:
+class ReturnPairs:
     """Returns that two images of a camera show, and how their gray level changes."""
 
     old: Pixels
@@ -42,7 +42,7 @@ class FollowedReturns:
     """Whether both images show as many returns as it takes to say something, moving ones or not."""
 
 
-def followed_returns(own: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> Iterator[FollowedReturns]:
+def return_pairs(own: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> Iterator[ReturnPairs]:
     """Of pairs of a camera's images, spread over the drive: the returns that move by some pixels. Those in boxes are
     left out."""
     places = {index: place for place, index in enumerate(sweeps.indices)}
@@ -55,12 +55,10 @@ def followed_returns(own: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> It
         after = after * (before.mean() / after.mean().clamp(min=1.0))
         here, there = _places(old[moving]), _places(new[moving])
         level = before[here]
-        yield FollowedReturns(
-            here, there, (after[here] - level).abs(), (after[there] - level).abs(), len(old) >= FEWEST
-        )
+        yield ReturnPairs(here, there, (after[here] - level).abs(), (after[there] - level).abs(), len(old) >= FEWEST)
 
 
-def followed(frames: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> dict[int, float | None]:
+def gray_changes(frames: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> dict[int, float | None]:
     """Camera index -> how much the gray level changes at returns that are followed, over that at their old pixels.
 
     Right poses make it smaller than 1. If the axes of a camera are swapped, returns move anywhere, and following them
@@ -70,7 +68,7 @@ def followed(frames: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> dict[in
     found = {}
     for camera in sorted({view.indices[1] for view in frames.views}):
         own = frames.where(lambda view, camera=camera: view.indices[1] == camera)
-        returns = list(followed_returns(own, sweeps, tracks))
+        returns = list(return_pairs(own, sweeps, tracks))
         ratios = [
             float(each.moved.mean() / each.stayed.mean().clamp(min=0.5))
             for each in returns
