@@ -109,3 +109,23 @@ def _noise(gray: Float[Tensor, "h w"]) -> float:
     blocks, because edges are no noise."""
     differences = conv2d(gray[None, None], torch.tensor(_SECOND_DIFFERENCES)[None, None])[0, 0].abs()
     return float(differences.median()) * 1.4826 / 6
+
+
+@dataclass(frozen=True)
+class SkyShare:
+    """Of all pixels of the images that were looked at."""
+
+    share: float
+    error: float
+    """Standard error, by images."""
+    frames: int
+
+
+def sky_share(frames: Frames) -> SkyShare | None:
+    """The share of sky in images spread over the drive; None where they have no masks."""
+    masks = (frames[place].sky for place in spread(len(frames), MOST_FRAMES))
+    shares = torch.tensor([float(mask.float().mean()) for mask in masks if mask is not None])
+    if not len(shares):
+        return None
+    error = float(shares.std() / len(shares) ** 0.5) if len(shares) > 1 else 0.0
+    return SkyShare(float(shares.mean()), error, len(shares))

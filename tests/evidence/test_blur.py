@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Sweeps
-from sparsestreet.evidence.blur import blur_length, exposure_motions
+from sparsestreet.evidence.motion import blur_length, exposure_motions
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Camera, Shutter, View
 from tests.evidence.test_shear import CAMERA, sweep

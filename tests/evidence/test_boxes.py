@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.evidence.boxes import box_jitter
+from sparsestreet.evidence.motion import box_jitter
 from sparsestreet.types import Track
 from tests.scene.street import pose
 

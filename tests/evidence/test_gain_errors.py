@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.evidence.exposure import ImageGains, Links, PartGains
-from sparsestreet.evidence.gain_errors import EV, GainErrors, gain_errors
+from sparsestreet.evidence.exposure import EV, GainErrors, ImageGains, Links, PartGains, gain_errors
 from sparsestreet.types import Camera, View
 
 COUNT, REACH = 200, 3

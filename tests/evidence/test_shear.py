@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Sweeps
-from sparsestreet.evidence.shear import readout_shear
+from sparsestreet.evidence.motion import readout_shear
 from sparsestreet.types import Camera, Shutter, Sweep, View
 
 INTRINSICS = torch.tensor([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])

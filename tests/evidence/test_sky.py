@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
-from sparsestreet.evidence.sky import sky_share
+from sparsestreet.evidence.light import sky_share
 from sparsestreet.scene.effects import SkySettings
 from tests.scene.street import street_log, training_data
 

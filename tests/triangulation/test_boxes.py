@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from sparsestreet.triangulation.features import Features
+from sparsestreet.triangulation.matches import Features
 from sparsestreet.triangulation.points import Sighting, TriangulatedPoints
 from sparsestreet.triangulation.street import _from_box, _inside, _through_box
 from sparsestreet.types import Track

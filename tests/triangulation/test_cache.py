@@ -7,7 +7,13 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import as_frames
-from sparsestreet.triangulation import ImagePointSettings, StreetPoints, TriangulatedPoints, cache, cached_street_points
+from sparsestreet.triangulation import (
+    ImagePointSettings,
+    StreetPoints,
+    TriangulatedPoints,
+    cached_street_points,
+    street,
+)
 from sparsestreet.types import Camera, Frame, Track
 
 FRAMES = tuple(
@@ -37,7 +43,7 @@ POINTS = StreetPoints(_table(5), {"car": _table(2), "": _table(0)})
 def made(monkeypatch):
     """Each making of points adds one; the points are always the same."""
     makings = []
-    monkeypatch.setattr(cache, "street_points", lambda *inputs: makings.append(inputs) or POINTS)
+    monkeypatch.setattr(street, "street_points", lambda *inputs: makings.append(inputs) or POINTS)
     return makings
 
 
@@ -59,7 +65,7 @@ def test_points_are_read_back_as_they_were(tmp_path, made):
 
 
 def test_a_street_without_boxes_is_read_back(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "street_points", lambda *inputs: StreetPoints(_table(1), {}))
+    monkeypatch.setattr(street, "street_points", lambda *inputs: StreetPoints(_table(1), {}))
     assert dict(_get(tmp_path).in_boxes) == dict(_get(tmp_path).in_boxes) == {}
 
 
@@ -142,7 +148,7 @@ def test_other_settings_make_other_points(tmp_path, made, change):
 
 def test_another_version_makes_other_points(tmp_path, made, monkeypatch):
     _get(tmp_path)
-    monkeypatch.setattr(cache, "VERSION", cache.VERSION + 1)
+    monkeypatch.setattr(street, "VERSION", street.VERSION + 1)
     _get(tmp_path)
     assert len(made) == 2
 
@@ -159,7 +165,7 @@ def test_an_interrupted_making_leaves_nothing(tmp_path, made, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(cache, "_write", interrupted)
+        patch.setattr(street, "_write", interrupted)
         with pytest.raises(KeyboardInterrupt):
             _get(tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sparsestreet.triangulation.features import SIFT_WIDTH, find_features
+from sparsestreet.triangulation.matches import SIFT_WIDTH, find_features
 
 
 def _blobs(centers, width, height, sigma=2.0, aspect=1.0):

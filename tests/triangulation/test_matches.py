@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sparsestreet.triangulation import matches
-from sparsestreet.triangulation.features import Features
-from sparsestreet.triangulation.matches import SAME_PLACE, guided_matches
+from sparsestreet.triangulation.matches import SAME_PLACE, Features, guided_matches
 from tests.triangulation.worlds import FOCAL, HEIGHT, WIDTH, cloud, descriptors, imaged, pose, rail
 
 FIRST, SECOND = rail([0.0, 1.0])

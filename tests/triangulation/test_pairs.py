@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from sparsestreet.triangulation.pairs import image_pairs, in_image
+from sparsestreet.triangulation.matches import image_pairs, in_image
 from tests.triangulation.worlds import INTRINSICS, pose, view
 
 

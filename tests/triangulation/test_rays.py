@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from sparsestreet.triangulation.rays import (
+from sparsestreet.triangulation.points import (
     Observations,
     _reprojection,
     _solved,

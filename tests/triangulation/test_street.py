@@ -12,7 +12,7 @@ from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.data.synthetic.tracer import BACKGROUND
 from sparsestreet.geometry.lenses import distort
 from sparsestreet.triangulation import ImagePointSettings, street_points
-from sparsestreet.triangulation.features import Features
+from sparsestreet.triangulation.matches import Features
 from sparsestreet.triangulation.street import _pixel, _rays, _sighting
 from sparsestreet.types import Camera
 from tests.triangulation.conftest import traced
