@@ -349,7 +349,8 @@ class GainErrors:
     removed: float
     """Root of the difference of the squares, 0 where neighbors foretell nothing: what a gain for each image removes."""
     noise: float | None
-    """Standard error of ``removed``, by leaving out one of ``ERROR_BLOCKS`` parts of the drive at a time; None: one part."""
+    """Standard error of ``removed``, by leaving out one of ``ERROR_BLOCKS`` parts of the drive at a time; None: one
+    part."""
     color: float
     """The part of ``without`` in which channels differ from each other."""
     agreement: float
