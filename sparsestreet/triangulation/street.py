@@ -20,8 +20,7 @@ from sparsestreet.files import read_npz
 from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.lenses import undistort
 from sparsestreet.triangulation.matches import Features, find_features
-from sparsestreet.triangulation.points import Sighting, TriangulatedPoints, triangulate
-from sparsestreet.triangulation.settings import ImagePointSettings
+from sparsestreet.triangulation.points import ImagePointSettings, Sighting, TriangulatedPoints, triangulate
 from sparsestreet.types import Camera, Frame, Track, View
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from sparsestreet.data.hood import check_used
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import split
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 
 SPLIT = partial(split, offset=1)
 """Three frames are enough for it."""

@@ -18,7 +18,7 @@ from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.ranks import Ranks
 from sparsestreet.types import Frame, View
 from tests.data.drivestudio.folders import make_nuscenes
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 from tests.training.stubs import frame_at
 
 

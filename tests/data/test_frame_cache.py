@@ -32,7 +32,7 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.problems import LogError
 from sparsestreet.types import Camera, Frame
 from tests.data.drivestudio.folders import make_nuscenes
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 from tests.data.test_datamodule import Recorder, StopError, fit, keys
 
 MASKS = ("sky", "human", "vehicle", "ego")

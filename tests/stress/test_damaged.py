@@ -25,7 +25,7 @@ from tests.stress.runs import (
     on_drive,
     street_of,
 )
-from tests.triangulation.test_cache import POINTS, _get
+from tests.triangulation.test_street import POINTS, _get
 
 empty = written(b"")
 

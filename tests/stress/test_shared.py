@@ -12,7 +12,7 @@ from tests.cli.conftest import street_at
 from tests.cli.test_killed_sweep import content
 from tests.stress.forked import Forked
 from tests.stress.runs import SHORT, contents
-from tests.triangulation.test_cache import POINTS, _get
+from tests.triangulation.test_street import POINTS, _get
 
 RUNS = 8
 

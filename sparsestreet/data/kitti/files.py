@@ -386,7 +386,7 @@ def point_stamps(points: Float64[Tensor, "n 3"], begin: int, end: int) -> Int64[
 
     Seen from above the sensor turns clockwise, from behind over left, front and right:
     begin + (pi - atan2(y, x)) / (2 pi) (end - begin). KITTI's readme says counter-clockwise, but edges of the lidar lie
-    on edges of the images best for a clockwise turn (tests/data/kitti/test_sample.py), and KITTI-360's development kit
+    on edges of the images best for a clockwise turn (tests/data/kitti/test_genuine.py), and KITTI-360's development kit
     moves points so too.
     """
     fraction = (torch.pi - torch.atan2(points[:, 1], points[:, 0])) / (2 * torch.pi)

@@ -12,7 +12,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.timestamps import LogClock, read_stamps
 from sparsestreet.types import Frame, Shutter, View
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 from tests.typed import there
 
 SINCE_1970 = 1_532_402_927_600_000_251

@@ -1,16 +1,22 @@
 """One drive as nuScenes' tables and in DriveStudio's layout, and one genuine keyframe of nuScenes."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.convert import Source, convert
+from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
+from sparsestreet.data.drivestudio.annotations import class_in
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
 from sparsestreet.data.recording import Recording
 from sparsestreet.geometry.cameras import inverse, transform_points
 from tests.data.nuscenes.keyframe import summary_of, write_keyframe
-from tests.data.nuscenes.written import token
+from tests.data.nuscenes.written import sweep_end, token, write_nuscenes
+from tests.data.plan import Plan, check_same_masks, check_same_sweeps, check_same_track, check_same_views
 from tests.typed import there
 
 pytestmark = pytest.mark.lengthy
@@ -132,3 +138,110 @@ def test_genuine_boxes_hold_the_returns_that_annotators_counted(recorded, keyfra
     assert len(counts) == 66
     assert (ours == theirs).mean() > 0.85
     assert ours.sum() == pytest.approx(theirs.sum(), rel=0.02)
+
+
+FRAMES = 12
+
+
+def check_converted(log: DrivingLog, folder: Path) -> None:
+    """Frames, poses, returns and boxes of what is written and read again."""
+    convert(log, Source(log.name, "0" * 12), DriveStudioWriter(jpeg_quality=None), folder)
+    assert DriveStudioReader(folder).check() == []
+    found = DriveStudioReader(folder).read()
+    check_same_views(found, log)
+    check_same_sweeps(found, log)
+    moved = 0
+    for one, other in zip(found.frames, log.frames, strict=True):
+        assert torch.equal(one.image, other.image)
+        check_same_masks(one, other)
+        assert one.depth is not None
+        assert other.depth is not None
+        moved += int(((one.depth - other.depth).abs() > 1e-4).sum())
+    # Returns are rounded to 4 micrometers: of 400,000 few lie so near to the border of a pixel.
+    assert moved < 40
+    known = [class_in("nuscenes", track.class_name) for track in log.tracks]
+    assert [track.class_name for track in found.tracks] == known
+    for one, other in zip(found.tracks, log.tracks, strict=True):
+        check_same_track(found, one, log, other)
+    assert found.radius == pytest.approx(log.radius, rel=1e-6)
+
+
+def test_drivestudios_layout(kitti, tmp_path):
+    log = DriveStudioReader(kitti, last_frame=FRAMES - 1).read()
+    check_converted(log, tmp_path / "out")
+
+
+def test_nuscenes_tables(recorded, tmp_path):
+    reader = NuScenesReader(root=recorded("kitti_0001_nuscenes"), principal_shift=0, last_frame=FRAMES - 1)
+    check_converted(reader.read(), tmp_path / "out")
+
+
+_PIXELS = Image.MAX_IMAGE_PIXELS
+devkit = pytest.importorskip("nuscenes.nuscenes", reason="nuscenes-devkit is not installed")
+data_classes = pytest.importorskip("nuscenes.utils.data_classes")
+Quaternion = pytest.importorskip("pyquaternion").Quaternion
+# It lifts Pillow's limit for all.
+Image.MAX_IMAGE_PIXELS = _PIXELS
+PLAN = Plan()
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory) -> tuple:
+    root = write_nuscenes(tmp_path_factory.mktemp("nuscenes") / "drive", PLAN).root
+    return devkit.NuScenes("v1.0-mini", str(root), verbose=False), NuScenesReader(root=root).recording()
+
+
+def samples(theirs) -> list[dict]:
+    """In the order of the chain."""
+    found, token = [], theirs.scene[0]["first_sample_token"]
+    while token:
+        found.append(theirs.get("sample", token))
+        token = found[-1]["next"]
+    return found
+
+
+def test_poses_and_intrinsics_of_images(both):
+    theirs, recording = both
+    for shot in recording.shots:
+        channel = recording.rig[shot.camera].name
+        data = theirs.get("sample_data", samples(theirs)[shot.frame]["data"][channel])
+        mount = theirs.get("calibrated_sensor", data["calibrated_sensor_token"])
+        ego = theirs.get("ego_pose", data["ego_pose_token"])
+        rotation = Quaternion(ego["rotation"]) * Quaternion(mount["rotation"])
+        center = Quaternion(ego["rotation"]).rotate(np.array(mount["translation"])) + ego["translation"]
+        assert np.allclose(shot.world_from_camera[:3, :3], rotation.rotation_matrix, rtol=0, atol=1e-12)
+        assert np.allclose(shot.world_from_camera[:3, 3], center, rtol=0, atol=1e-11)
+        shift = recording.rig[shot.camera].intrinsics.double().numpy() - mount["camera_intrinsic"]
+        assert np.allclose(shift, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], rtol=0, atol=1e-5)
+        assert theirs.get_sample_data_path(data["token"]) == str(shot.key)
+
+
+def test_boxes_at_keyframes(both):
+    theirs, recording = both
+    (boxes,) = there(recording.boxes)
+    for frame, sample in enumerate(samples(theirs)):
+        (box,) = theirs.get_boxes(sample["data"]["LIDAR_TOP"])
+        assert 1000 * sample["timestamp"] == boxes.stamps[frame] == sweep_end(PLAN, frame)
+        assert np.allclose(boxes.poses[frame, :3, 3], box.center, rtol=0, atol=1e-11)
+        assert np.allclose(boxes.poses[frame, :3, :3], box.rotation_matrix, rtol=0, atol=1e-12)
+        assert box.wlh[[1, 0, 2]].tolist() == boxes.sizes[frame].tolist()
+        # The devkit's corners: x along the length, y left, z up.
+        signs = box.corners()[:, 0] - box.center
+        ours = boxes.poses[frame, :3, :3] @ (boxes.sizes[frame] / 2)
+        assert np.allclose(signs, ours, rtol=0, atol=1e-9)
+        assert box.name == boxes.class_name
+
+
+def test_points(both):
+    theirs, recording = both
+    for frame, sample in enumerate(samples(theirs)):
+        data = theirs.get("sample_data", sample["data"]["LIDAR_TOP"])
+        cloud = data_classes.LidarPointCloud.from_file(theirs.get_sample_data_path(data["token"]))
+        near = np.linalg.norm(cloud.points[:3], axis=0) < 2.5
+        assert near.sum() == 1
+        mount = theirs.get("calibrated_sensor", data["calibrated_sensor_token"])
+        ego = theirs.get("ego_pose", data["ego_pose_token"])
+        points = cloud.points[:3, ~near].astype(float)
+        for pose in (mount, ego):
+            points = Quaternion(pose["rotation"]).rotation_matrix @ points + np.array(pose["translation"])[:, None]
+        assert torch.allclose(there(recording.sweeps)[frame].read(), torch.from_numpy(points.T), rtol=0, atol=1e-9)
