@@ -8,6 +8,7 @@ import yaml
 from rich.console import Console
 
 from sparsestreet.cli.commands.options import run_command
+from sparsestreet.files import read_yaml
 from sparsestreet.metrics.definitions import PROTOCOLS, Protocol
 from sparsestreet.report import collect, figure, markdown, sections, tables
 from sparsestreet.report.arms import arms
