@@ -6,11 +6,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from sparsestreet.data.doubts import doubts
-from sparsestreet.data.ego import check_used
-from sparsestreet.data.hood import find_hoods, with_ego
-from sparsestreet.data.log import DrivingLog, Split, split
-from sparsestreet.data.notes import counted
+from sparsestreet.data.hood import check_used, find_hoods, with_ego
+from sparsestreet.data.log import DrivingLog, Split, counted, split
+from sparsestreet.data.log_warnings import log_warnings
 from sparsestreet.data.reader import LogReader
 from sparsestreet.geometry.boxes import displacement
 
@@ -52,7 +50,7 @@ def _report_log(log: DrivingLog, reader: LogReader, console: Console, split_of: 
     for note in log.notes:
         _line(console, "yellow", "note", note)
     masks = {camera: hood.mask for camera, hood in find_hoods(log.frames, log.sweeps).items()}
-    for doubt in doubts(log, with_ego(log.frames, masks)):
+    for doubt in log_warnings(log, with_ego(log.frames, masks)):
         _line(console, "bold yellow", "doubt", doubt)
     try:
         split_of(log)

@@ -9,13 +9,11 @@ from jaxtyping import Int
 from lightning import LightningDataModule
 from torch import Tensor
 
-from sparsestreet.data.device import to_device
-from sparsestreet.data.dirt import find_dirt
-from sparsestreet.data.frame_cache import Prefetcher, prefetched
-from sparsestreet.data.hood import find_hoods, with_ego
+from sparsestreet.data.frame_cache import Prefetcher, prefetched, to_device
+from sparsestreet.data.hood import find_dirt, find_hoods, with_ego
 from sparsestreet.data.lazy import Frames, spread
+from sparsestreet.data.lidar import recolored
 from sparsestreet.data.log import DrivingLog, split
-from sparsestreet.data.recolored import recolored
 from sparsestreet.phases import phase
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.types import Frame

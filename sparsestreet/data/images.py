@@ -10,18 +10,19 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from io import BytesIO
 from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.problems import LogError, Problem, attempt, fault
-from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.rig import Undistortion
 
 logger = logging.getLogger(__name__)
 
@@ -365,3 +366,88 @@ def _opened(path: Path, read: Callable[[Image.Image], T]) -> T:
     # Pillow reports a broken PNG chunk as SyntaxError.
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise fault(path, f"the image cannot be decoded ({error})", _REMEDY) from error
+
+
+def jpeg(image: UInt8[np.ndarray, "h w 3"], quality: int) -> bytes:
+    """RGB, 4:4:4, because halved color would smear edges, for which a small image has few pixels."""
+    file = BytesIO()
+    Image.fromarray(image).save(file, "JPEG", quality=quality, subsampling=0)
+    return file.getvalue()
+
+
+def png(pixels: UInt8[np.ndarray, "h w *c"]) -> bytes:
+    """RGB or gray, without loss."""
+    file = BytesIO()
+    Image.fromarray(pixels).save(file, "PNG")
+    return file.getvalue()
+
+
+def mask_png(mask: Bool[np.ndarray, "h w"]) -> bytes:
+    """White where the mask is true."""
+    return png(mask.astype(np.uint8) * 255)
+
+
+def number_lines(numbers: Float[np.ndarray, "..."] | Sequence[float]) -> bytes:
+    """Rows of a matrix, or a number a line, with all digits of float64."""
+    file = BytesIO()
+    np.savetxt(file, numbers)
+    return file.getvalue()
+
+
+_KINDS = ("sky", "human", "vehicle", "ego")
+
+
+@dataclass(frozen=True)
+class GivenMasks:
+    """PNGs ``KIND/CAMERA/STEM.png``, white where the kind is, at the size of the recorded images.
+
+    A camera without a folder has no masks of the kind; one with a folder has them for all of its images.
+    """
+
+    root: Path
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        return frozenset(kind for kind in _KINDS if (self.root / kind).is_dir())
+
+    def paths(self, camera: str, stem: str) -> dict[str, Path]:
+        """Kind -> the file of an image, for the kinds that its camera has."""
+        folders = {kind: self.root / kind / camera for kind in _KINDS}
+        return {kind: folder / f"{stem}.png" for kind, folder in folders.items() if folder.is_dir()}
+
+    def read(
+        self,
+        camera: str,
+        stem: str,
+        *,
+        recorded_size: tuple[int, int],
+        size: tuple[int, int],
+        undistortion: Undistortion | None = None,
+    ) -> dict[str, Bool[Tensor, "h w"]]:
+        """Kind -> mask at ``size``, both (width, height), without the lens if told.
+
+        Raises LogError for a file that is missing or broken.
+        """
+        masks = {}
+        for kind, path in self.paths(camera, stem).items():
+            if not path.is_file():
+                raise fault(path, "the mask is missing", "write a mask for every image, or remove the camera's folder")
+            if (found := image_size(path)) != recorded_size:
+                message = "the mask is {}x{}, the camera's images are {}x{}".format(*found, *recorded_size)
+                raise fault(path, message, "write masks at the size of the recorded images")
+            masks[kind] = read_mask(path, size, sky=kind == "sky", undistortion=undistortion)
+        return masks
+
+    def check(self, images: Iterable[tuple[str, str]]) -> list[Problem]:
+        """What is missing for some images, each a camera and a stem."""
+        if not self.kinds:
+            message = f"it holds none of the folders {', '.join(_KINDS)}"
+            return [Problem(self.root, message, "name the folder that holds them (data.log.masks), or null")]
+        return missing_files(path for camera, stem in images for path in self.paths(camera, stem).values())
+
+    def check_pixels(self, images: Iterable[tuple[str, str]], size: tuple[int, int]) -> list[Problem]:
+        """What is wrong with those that are there, all of which are decoded; ``size``: (width, height) as recorded."""
+        problems: list[Problem] = []
+        for path in filter(Path.is_file, (path for each in images for path in self.paths(*each).values())):
+            attempt(problems, partial(check_mask, path, size, decode=True))
+        return problems

@@ -12,10 +12,34 @@ from torch import Tensor
 
 from sparsestreet.data.hood import Hood
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
-from sparsestreet.data.notes import counted
 from sparsestreet.data.tracks import repeated
 from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.types import Frame, SparsePoints, Track, View
+
+_ABSENT = {
+    "sky": "no sky masks: nothing but the images tells sky from scene, and there is no sky term in the loss",
+    "human": "no human masks: there are no metrics of human pixels",
+    "vehicle": "no vehicle masks: there are no metrics of vehicle pixels",
+    "lidar": "no lidar: Gaussians start from points in images and random ones, and there is no depth term in the loss",
+    "boxes": "no boxes: nothing is modeled as moving, whatever moves becomes part of the background",
+    "clock": "no clock: the frame rate is unknown, and a video plays at the one that log_fps says",
+}
+
+
+def counted(number: int, noun: str) -> str:
+    """Return both, the noun in the plural unless there is one.
+
+    >>> counted(1, "sweep"), counted(2, "sweep")
+    ('1 sweep', '2 sweeps')
+    """
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def absence_notes(*, sky: bool, human: bool, vehicle: bool, lidar: bool, boxes: bool, clock: bool) -> tuple[str, ...]:
+    """A sentence for each part that a log does not have, of which a reader says for each whether it is there."""
+    present = {"sky": sky, "human": human, "vehicle": vehicle, "lidar": lidar, "boxes": boxes, "clock": clock}
+    return tuple(sentence for part, sentence in _ABSENT.items() if not present[part])
+
 
 _QUANTILES = (0.02, 0.98)
 _FLATTEST = 0.01
@@ -53,7 +77,7 @@ class DrivingLog:
 
     name: str
     frames: Frames
-    """Ordered by (frame_index, camera_index), decoded when indexed; ``Frames.of`` takes frames that are in memory."""
+    """Ordered by (frame_index, camera_index), decoded when indexed; ``as_frames`` takes frames that are in memory."""
     sweeps: Sweeps
     """Ordered by index, read when indexed; ``Sweeps.of(())`` where the log has no lidar."""
     tracks: tuple[Track, ...]

@@ -16,14 +16,12 @@ import torch
 from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, check_image_sizes, read_image, read_mask
-from sparsestreet.data.poses import check_rigid
+from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_image, read_mask
+from sparsestreet.data.poses import check_extent, check_rigid
 from sparsestreet.data.problems import Problem, attempt, fault, missing_files, missing_notes
+from sparsestreet.data.reader import chosen_cameras, frame_window
 from sparsestreet.data.recording import RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
-from sparsestreet.data.window import chosen_cameras, frame_window
 from sparsestreet.geometry.lenses import Lens
 
 SparsePointsReader = Callable[[], tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]]

@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.clock import LogClock
 from sparsestreet.data.poses import are_rigid, check_rigid, recentered
 from sparsestreet.data.problems import fault
+from sparsestreet.data.timestamps import LogClock
 from sparsestreet.types import Track, View
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, UInt16
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file
-from sparsestreet.data.device import to_device
+from sparsestreet.data.frame_cache import to_device
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.data.lidar import near_returns
 from sparsestreet.metrics.definitions import quantities_of

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.device import to_device
+from sparsestreet.data.frame_cache import to_device
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Truth
 from sparsestreet.evaluation.evaluate import frame_quality, quantized, restored, screen_image

@@ -1,5 +1,7 @@
-"""How dark, how noisy and how cut off the images are: what night, flare and a wrong exposure leave in them."""
+"""Measure how dark, noisy and clipped the images are: night, flare or a wrong exposure, which no scene simulates."""
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +16,12 @@ from sparsestreet.types import Frame
 MOST_FRAMES = 36
 WHITE = 250
 """Of 255: a pixel is cut off where red, green and blue have at least this; JPEG moves white by a few levels."""
+MIN_STOPS = 1.25
+"""Stops of the stored values below middle gray from which a log is dark: a mean gray level of 50 of 255."""
+MIN_CLIPPED = 0.02
+"""Share of clipped pixels, of those that are not sky, from which a log is doubted."""
+_MIDDLE_GRAY = 118.0
+"""Gray level of 255 that an exposure control aims at: 18 % of the light, in sRGB."""
 _SECOND_DIFFERENCES = ((1.0, -2.0, 1.0), (-2.0, 4.0, -2.0), (1.0, -2.0, 1.0))
 
 
@@ -33,6 +41,36 @@ class Light:
     """Share of them in the image that has most, which is of ``worst_frame``."""
     worst_frame: int
     images: int
+
+    @property
+    def stops(self) -> float:
+        """Stops of the stored values by which the median image lies below middle gray."""
+        return math.log2(_MIDDLE_GRAY / max(self.level, 0.5))
+
+    def numbers(self) -> dict[str, float]:
+        """Return what ``run.json`` keeps, by name."""
+        return {
+            "stops_below_middle_gray": self.stops,
+            "mean_gray_level": self.level,
+            "noise_gray_levels": self.noise,
+            "clipped_share": self.clipped,
+            "clipped_share_of_worst_image": self.worst,
+        }
+
+
+def light_warnings(light: Light) -> Iterator[str]:
+    """Yield one sentence for each thing about the light that no scene simulates."""
+    if light.stops >= MIN_STOPS:
+        yield (
+            f"{light.images} images have a mean gray level of {light.level:.0f} of 255, and a noise of "
+            f"{light.noise:.1f} levels: noise is a large part of them, and nothing simulates it"
+        )
+    if light.clipped >= MIN_CLIPPED:
+        yield (
+            f"{100 * light.clipped:.1f} % of the street's pixels are clipped at white in {light.images} images, most "
+            f"in frame {light.worst_frame} ({100 * light.worst:.1f} %), as where the sun shines into the lens: nothing "
+            "simulates it"
+        )
 
 
 def measured_light(frames: Frames) -> Light:
@@ -71,3 +109,23 @@ def _noise(gray: Float[Tensor, "h w"]) -> float:
     blocks, because edges are no noise."""
     differences = conv2d(gray[None, None], torch.tensor(_SECOND_DIFFERENCES)[None, None])[0, 0].abs()
     return float(differences.median()) * 1.4826 / 6
+
+
+@dataclass(frozen=True)
+class SkyShare:
+    """Of all pixels of the images that were looked at."""
+
+    share: float
+    error: float
+    """Standard error, by images."""
+    frames: int
+
+
+def sky_share(frames: Frames) -> SkyShare | None:
+    """The share of sky in images spread over the drive; None where they have no masks."""
+    masks = (frames[place].sky for place in spread(len(frames), MOST_FRAMES))
+    shares = torch.tensor([float(mask.float().mean()) for mask in masks if mask is not None])
+    if not len(shares):
+        return None
+    error = float(shares.std() / len(shares) ** 0.5) if len(shares) > 1 else 0.0
+    return SkyShare(float(shares.mean()), error, len(shares))

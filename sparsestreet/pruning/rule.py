@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sparsestreet.data.device import to_device
+from sparsestreet.data.frame_cache import to_device
 from sparsestreet.ops import contribution
 from sparsestreet.pruning.floors import Floors, InstanceAreas
 from sparsestreet.ranks import ALONE, Ranks

@@ -123,6 +123,8 @@ class RunDescription:
     finite."""
     effects: tuple[EffectDecision, ...] = ()
     """The plan of effects, in the order in which they act on an image; empty: the record is older."""
+    light: dict[str, float] = field(default_factory=dict)
+    """How dark, noisy and clipped the images are (``evidence/light.py``); empty: the record is older."""
     machine: Machine
     source: CodeVersion
 

@@ -8,7 +8,7 @@ from statistics import median
 import torch
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.device import to_device
+from sparsestreet.data.frame_cache import to_device
 from sparsestreet.data.lazy import spread
 from sparsestreet.evaluation.evaluate import evaluate_frames, screen_image
 from sparsestreet.evaluation.speed import Timing

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.evidence.light import measured_light
 from sparsestreet.records.configuration import Setting, config_hash
 from sparsestreet.records.run import EffectDecision, RunDescription, this_machine, this_source
 from sparsestreet.training.recipe import Recipe
@@ -51,6 +52,7 @@ class RunIdentity:
             noise=None,
             caps={},
             effects=effects,
+            light=measured_light(data.split.train).numbers(),
             machine=this_machine(),
             source=this_source(),
         )

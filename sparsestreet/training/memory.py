@@ -4,7 +4,7 @@ import logging
 
 import torch
 
-from sparsestreet.data import free_memory
+from sparsestreet.data import frame_cache
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.training.forecast import largest
@@ -71,7 +71,7 @@ def bytes_for_growth(device: torch.device) -> float:
     if device.type == "cuda":
         free = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
         return (1 - MARGIN) * (free - torch.cuda.max_memory_allocated(device))
-    free = free_memory.free_bytes()
+    free = frame_cache.free_bytes()
     return float("inf") if free is None else (1 - MARGIN) * free
 
 

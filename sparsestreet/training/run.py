@@ -16,10 +16,11 @@ from lightning import Callback, Trainer, seed_everything
 from lightning.pytorch.loggers import CSVLogger, Logger
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.doubts import doubts
-from sparsestreet.data.ego import check_used
+from sparsestreet.data.hood import check_used
+from sparsestreet.data.log_warnings import log_warnings
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.run import evaluate_scene, help_to_evaluate
+from sparsestreet.evidence.light import light_warnings, measured_light
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.pictures.plots import draw_history
 from sparsestreet.pictures.sheets import draw_effects
@@ -177,8 +178,9 @@ def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
     for note in data.driving_log.notes:
         log.info(note)
     with stage("initialize"):
-        check_used(data.split.train, data.driving_log.name)
-        for doubt in doubts(data.driving_log, data.split.train):
+        train = data.split.train
+        check_used(train, data.driving_log.name)
+        for doubt in (*log_warnings(data.driving_log, train), *light_warnings(measured_light(train))):
             log.warning(doubt)
         return recipe.build(data, plan)
 

@@ -5,9 +5,7 @@ computes where the rays of a point meet, ``points`` turns views into points. ``s
 what is in boxes, and ``cache`` keeps the points on disk.
 """
 
-from sparsestreet.triangulation.cache import cached_street_points
-from sparsestreet.triangulation.points import TriangulatedPoints
-from sparsestreet.triangulation.settings import ImagePointSettings
-from sparsestreet.triangulation.street import StreetPoints, street_points
+from sparsestreet.triangulation.points import ImagePointSettings, TriangulatedPoints
+from sparsestreet.triangulation.street import StreetPoints, cached_street_points, street_points
 
 __all__ = ["ImagePointSettings", "StreetPoints", "TriangulatedPoints", "cached_street_points", "street_points"]

@@ -27,7 +27,7 @@ from sparsestreet.records.run import RUN
 from sparsestreet.scene.effects import SkySettings
 from sparsestreet.training.callbacks import DensityControl, PhaseTimes, RowLedger
 from tests.cli.configurations import composed
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 from tests.evaluation.frames import make_run, make_summary
 from tests.training.stubs import background, make_system
 from tests.typed import as_a

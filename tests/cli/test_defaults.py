@@ -65,8 +65,6 @@ def streetgs() -> Recipe:
             "box_poses": effects.BoxPosesSettings(),
             "motion_blur": effects.MotionBlurSettings(),
             "dirt": effects.DirtSettings(),
-            "night": effects.NightSettings(),
-            "saturation": effects.SaturationSettings(),
         },
         losses={"photometric": Photometric(), "sky": SkyMask(), "depth": Depth()},
         callbacks={

@@ -12,11 +12,11 @@ from rich.console import Console
 
 from sparsestreet.data.check import report_check
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.ego import check_used
+from sparsestreet.data.hood import check_used
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import split
 from tests.data.drivestudio.folders import make_nuscenes, make_waymo
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 
 SPLIT = partial(split, offset=1)
 """Three frames are enough for it."""

@@ -14,7 +14,7 @@ import pytest
 from sparsestreet.data.convert import DESCRIPTION, LogFile, LogWriter, Show, Source, convert, partial_folder
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
 from sparsestreet.data.log import DrivingLog
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 
 SOURCE = Source("tiny", "0123456789ab", {"width": None})
 

@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import HOST, ShuffledFrames, StreetData
-from sparsestreet.data.device import to_device
 from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.frame_cache import to_device
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.ranks import Ranks
 from sparsestreet.types import Frame, View
 from tests.data.drivestudio.folders import make_nuscenes
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 from tests.training.stubs import frame_at
 
 

@@ -15,7 +15,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sparsestreet.data import frame_cache, free_memory
+from sparsestreet.data import frame_cache
 from sparsestreet.data.datamodule import HOST, OrderedFrames, ShuffledFrames, StreetData
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.frame_cache import (
@@ -32,7 +32,7 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.data.problems import LogError
 from sparsestreet.types import Camera, Frame
 from tests.data.drivestudio.folders import make_nuscenes
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 from tests.data.test_datamodule import Recorder, StopError, fit, keys
 
 MASKS = ("sky", "human", "vehicle", "ego")
@@ -219,32 +219,32 @@ def limited(root, *, limit: str, used: int, files: int):
 def test_free_memory_is_what_the_machine_and_every_group_around_leave(tmp_path, monkeypatch):
     system, own, root = tmp_path / "meminfo", tmp_path / "cgroup", tmp_path / "fs"
     system.write_text("MemTotal:       9000 kB\nMemAvailable:   8000 kB\nHugePages_Total:       0\n")
-    monkeypatch.setattr(free_memory, "_SYSTEM", system)
-    monkeypatch.setattr(free_memory, "_OWN_GROUPS", own)
-    monkeypatch.setattr(free_memory, "_V2", dataclasses.replace(free_memory._V2, root=root))
-    monkeypatch.setattr(free_memory, "_V1", dataclasses.replace(free_memory._V1, root=tmp_path / "none"))
-    assert free_memory.free_bytes() == 8000 * 1024
+    monkeypatch.setattr(frame_cache, "_SYSTEM", system)
+    monkeypatch.setattr(frame_cache, "_OWN_GROUPS", own)
+    monkeypatch.setattr(frame_cache, "_V2", dataclasses.replace(frame_cache._V2, root=root))
+    monkeypatch.setattr(frame_cache, "_V1", dataclasses.replace(frame_cache._V1, root=tmp_path / "none"))
+    assert frame_cache.free_bytes() == 8000 * 1024
     own.write_text("4:memory:/other\n0::/job_7/step_0\n")
     limited(root / "job_7/step_0", limit="max", used=100, files=0)
-    assert free_memory.free_bytes() == 8000 * 1024
+    assert frame_cache.free_bytes() == 8000 * 1024
     limited(root / "job_7", limit="5000000", used=1_000_000, files=200_000)
-    assert free_memory.free_bytes() == 4_200_000  # files that the system remembers go first
+    assert frame_cache.free_bytes() == 4_200_000  # files that the system remembers go first
     limited(root / "job_7/step_0", limit="1000", used=2000, files=0)
-    assert free_memory.free_bytes() == 0
+    assert frame_cache.free_bytes() == 0
     system.unlink()
-    assert free_memory.free_bytes() is None
+    assert frame_cache.free_bytes() is None
 
 
 def test_the_first_version_of_groups_counts_too(tmp_path, monkeypatch):
     own, root = tmp_path / "cgroup", tmp_path / "memory"
     own.write_text("5:cpu:/x\n4:memory:/job\n0::/\n")
-    monkeypatch.setattr(free_memory, "_OWN_GROUPS", own)
-    monkeypatch.setattr(free_memory, "_V2", dataclasses.replace(free_memory._V2, root=tmp_path / "none"))
-    monkeypatch.setattr(free_memory, "_V1", dataclasses.replace(free_memory._V1, root=root))
+    monkeypatch.setattr(frame_cache, "_OWN_GROUPS", own)
+    monkeypatch.setattr(frame_cache, "_V2", dataclasses.replace(frame_cache._V2, root=tmp_path / "none"))
+    monkeypatch.setattr(frame_cache, "_V1", dataclasses.replace(frame_cache._V1, root=root))
     (root / "job").mkdir(parents=True)
     for name, text in (("limit_in_bytes", "4096"), ("usage_in_bytes", "96"), ("stat", "total_inactive_file 6")):
         (root / "job" / f"memory.{name}").write_text(text)
-    assert free_memory.free_bytes() == 4006
+    assert frame_cache.free_bytes() == 4006
 
 
 LOG = make_log(9, 2)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sparsestreet.data.frame_cache import LruCache
 from sparsestreet.data.lazy import Frames, LazySequence, Sweeps, as_frames
 from sparsestreet.types import Frame, Sweep, View
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 
 LOG = make_log(4, 2)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import split
 from sparsestreet.types import SparsePoints, Sweep, Track
-from tests.data.streets import make_log
+from tests.data.plan import make_log
 
 
 def sweep(points: torch.Tensor, colored: torch.Tensor) -> Sweep:

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from sparsestreet.data.motion import PosePath, untwisted
+from sparsestreet.data.poses import PosePath, untwisted
 from tests.data.plan import PER_SECOND, Plan, moved
 
 

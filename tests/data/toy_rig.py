@@ -12,20 +12,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.data.clock import LogClock
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.images import check_camera_images, image_size, read_image
 from sparsestreet.data.lidar import check_points
-from sparsestreet.data.log import DrivingLog
-from sparsestreet.data.notes import absence_notes
-from sparsestreet.data.poses import check_rigid, dataset_from_world, recentered
+from sparsestreet.data.log import DrivingLog, absence_notes
+from sparsestreet.data.poses import check_extent, check_rigid, dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
-from sparsestreet.data.reader import LogReader
+from sparsestreet.data.reader import LogFiles, LogReader, chosen_cameras, frame_window
+from sparsestreet.data.recording import SceneFolder
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
-from sparsestreet.data.scene_folder import SceneFolder
+from sparsestreet.data.timestamps import LogClock
 from sparsestreet.data.tracks import checked_track, timed_tracks, track_in_window
-from sparsestreet.data.window import chosen_cameras, frame_window
 from sparsestreet.types import Frame, Track, View
 
 

@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
-from sparsestreet.evidence.light import measured_light
-from sparsestreet.scene.effects import NightSettings, SaturationSettings, plan_effects
+from sparsestreet.evidence.light import light_warnings, measured_light, sky_share
+from sparsestreet.scene.effects import SkySettings
 from sparsestreet.types import Camera, Frame
-from tests.scene.street import training_data
+from tests.scene.street import street_log, training_data
 
 HEIGHT, WIDTH = 30, 40
 
@@ -57,19 +57,51 @@ def test_sky_and_car_do_not_count():
     assert measured_light(as_frames(nothing)).level == 128
 
 
-@pytest.mark.parametrize(("level", "night"), [(118, False), (60, False), (30, True), (0, True)])
-def test_night_is_reported_and_not_simulated(level: float, night: bool):
-    data = replace(training_data(), frames=frames(level))
-    (decision,) = plan_effects({"night": NightSettings()}, data).decisions(data, rows=0)
-    assert not decision.on
-    assert decision.reason.startswith("found, not simulated: ") is night
-    with pytest.raises(ValueError, match=r"effects.night is on, but 10 images .* nothing simulates it, or say auto"):
-        plan_effects({"night": NightSettings(when="on")}, data)
+@pytest.mark.parametrize(("level", "dark"), [(118, False), (60, False), (30, True), (0, True)])
+def test_dark_images_are_doubted(level: float, dark: bool):
+    said = tuple(light_warnings(measured_light(frames(level))))
+    assert [f"10 images have a mean gray level of {level} of 255" in line for line in said] == [True] * dark
 
 
-@pytest.mark.parametrize(("white", "found"), [(0.0, False), (0.1, False), (0.4, True)])
-def test_saturation_is_reported_and_not_simulated(white: float, found: bool):
-    data = replace(training_data(), frames=frames(90, white=white))
-    (decision,) = plan_effects({"saturation": SaturationSettings()}, data).decisions(data, rows=0)
-    assert not decision.on
-    assert decision.reason.startswith("found, not simulated: ") is found
+@pytest.mark.parametrize(("white", "clipped"), [(0.0, False), (0.1, False), (0.4, True)])
+def test_clipped_images_are_doubted_and_the_worst_is_named(white: float, clipped: bool):
+    said = tuple(light_warnings(measured_light(frames(90, white=white))))
+    assert ["most in frame 9 (40.0 %)" in line for line in said] == [True] * clipped
+
+
+def test_the_record_counts_stops():
+    numbers = measured_light(frames(59)).numbers()
+    assert numbers["stops_below_middle_gray"] == pytest.approx(1)  # half of 118
+    assert numbers["mean_gray_level"] == pytest.approx(59)
+
+
+def frames_sky(*shares: float) -> Frames:
+    """The street's first frames, each with this share of its pixels masked."""
+    made = []
+    for frame, share in zip(street_log().frames, shares, strict=False):
+        height, width, _ = frame.image.shape
+        mask = torch.arange(height * width).reshape(height, width) < share * height * width
+        made.append(replace(frame, sky=mask))
+    return as_frames(made)
+
+
+def test_mean_and_error_are_over_images():
+    found = sky_share(frames_sky(0.2, 0.4, 0.6))
+    assert found is not None
+    assert found.share == pytest.approx(0.4, abs=2e-3)  # a pixel of 33 x 21 is 0.0014
+    assert found.error == pytest.approx(0.2 / 3**0.5, abs=2e-3)
+    assert found.frames == 3
+
+
+@pytest.mark.parametrize(("share", "wanted"), [(0.0, False), (0.0025, False), (0.01, True)])
+def test_a_tunnel_has_none(share: float, wanted: bool):
+    data = replace(training_data(), frames=frames_sky(share, share))
+    found = SkySettings().detect(data)
+    assert (found.called_for, found.missing) == (wanted, None)
+
+
+def test_without_masks_there_is_a_sky():
+    data = training_data()
+    assert sky_share(as_frames([replace(frame, sky=None) for frame in data.frames])) is None
+    found = SkySettings().detect(replace(data, frames=as_frames([replace(frame, sky=None) for frame in data.frames])))
+    assert (found.called_for, found.value) == (True, None)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sparsestreet.training.callbacks.checkpoints import step_of
-from sparsestreet.triangulation import cache
+from sparsestreet.triangulation import street
 from tests.cli.test_killed_sweep import content
 from tests.data.damage import Damage, cut, written
 from tests.stress.forked import command
@@ -25,7 +25,7 @@ from tests.stress.runs import (
     on_drive,
     street_of,
 )
-from tests.triangulation.test_cache import POINTS, _get
+from tests.triangulation.test_street import POINTS, _get
 
 empty = written(b"")
 
@@ -191,7 +191,7 @@ def test_a_checkpoint_in_short(tmp_path):
 @pytest.mark.lengthy
 @pytest.mark.parametrize("damage", CACHES.values(), ids=CACHES)
 def test_a_cache_in_short(damage, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr(cache, "street_points", lambda *inputs: POINTS)
+    monkeypatch.setattr(street, "street_points", lambda *inputs: POINTS)
     _get(tmp_path)
     (path,) = tmp_path.iterdir()
     sound = path.read_bytes()

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from sparsestreet.cli import main
-from sparsestreet.triangulation import cache
+from sparsestreet.triangulation import street
 from tests.cli.conftest import street_at
 from tests.cli.test_killed_sweep import content
 from tests.stress.forked import Forked
 from tests.stress.runs import SHORT, contents
-from tests.triangulation.test_cache import POINTS, _get
+from tests.triangulation.test_street import POINTS, _get
 
 RUNS = 8
 
@@ -49,7 +49,7 @@ def test_eight_runs_share_their_caches(tmp_path):
 @pytest.mark.lengthy
 def test_the_short_form(tmp_path, monkeypatch):
     """Two processes ask for the same points, and find or make them."""
-    monkeypatch.setattr(cache, "street_points", lambda *inputs: POINTS)
+    monkeypatch.setattr(street, "street_points", lambda *inputs: POINTS)
 
     def ask() -> None:
         for _ in range(20):

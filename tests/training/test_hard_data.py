@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.doubts import doubts
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.log_warnings import log_warnings
 from sparsestreet.scene.effects import EffectPlan, ExposureSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.scene.rendering import render
@@ -127,7 +127,7 @@ def test_it_is_trained_and_the_user_is_told(name: str, tmp_path, caplog):
 @pytest.mark.lengthy
 def test_an_exposure_that_jumps_is_planned_for(tmp_path):
     log = wall_log(lambda instant, camera: torch.full((3,), 1.0 if instant < 6 else 0.5))
-    assert doubts(log) == ()
+    assert log_warnings(log) == ()
     (planned,) = trained(log, tmp_path, exposure=ExposureSettings()).effects
     assert planned.on
 
@@ -141,7 +141,7 @@ def test_what_tires_can_do_is_no_jump():
         shifted[0, 3] += 4.5 * (0.1 * frame.indices[0]) ** 2 + 0.2 * float(torch.randn((), generator=draw))
         return replace(frame, camera=replace(frame.camera, camera_from_world=shifted))
 
-    assert not [doubt for doubt in doubts(changed(braked)) if "accelerated" in doubt]
+    assert not [doubt for doubt in log_warnings(changed(braked)) if "accelerated" in doubt]
 
 
 def test_boxes_beside_each_other_share_nothing():
@@ -150,7 +150,7 @@ def test_boxes_beside_each_other_share_nothing():
     passing = box("passing", (1.8, 0.6, 1.7)).world_from_object.clone()
     passing[3:] += _aside(-1.2)
     log = changed(lambda frame: frame, beside, replace(box("passing", (1.8, 0.6, 1.7)), world_from_object=passing))
-    assert doubts(log) == ()
+    assert log_warnings(log) == ()
 
 
 def _aside(meters: float) -> torch.Tensor:
@@ -164,4 +164,4 @@ def test_a_camera_that_stands_is_right_whatever_its_axes_are():
         first = rolled(wall.frame(0, frame.indices[1], torch.ones(3)))
         return replace(frame, camera=first.camera, image=first.image)
 
-    assert doubts(changed(still)) == ()
+    assert log_warnings(changed(still)) == ()

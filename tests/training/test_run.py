@@ -20,6 +20,7 @@ from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
+from sparsestreet.evidence.light import measured_light
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import StageRecorder
 from sparsestreet.ranks import ALONE
@@ -327,6 +328,7 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
     expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
     expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2, "cameras": ("0 32x16",)}
     expected |= {"effects": (sky,), "rested": {}, "held_back": {}}
+    expected |= {"light": measured_light(data().split.train).numbers()}
     assert vars(found) == expected
 
 

@@ -17,7 +17,7 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor
 
-from sparsestreet.data.device import to_device
+from sparsestreet.data.frame_cache import to_device
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.density.vibrating import VibratingDensity
 from sparsestreet.scene.effects import (

@@ -6,7 +6,7 @@ import pytest
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.synthetic import StreetReader, StreetSettings
-from sparsestreet.data.synthetic.sensor import WAYMO_TOP
+from sparsestreet.data.synthetic.settings import WAYMO_TOP
 from tests.conftest import unchecked
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from sparsestreet.triangulation.features import Features
+from sparsestreet.triangulation.matches import Features
 from sparsestreet.triangulation.points import Sighting
 from sparsestreet.types import Camera, View
 

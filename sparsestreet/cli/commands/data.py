@@ -7,8 +7,7 @@ from pathlib import Path
 from sparsestreet.cli.commands.convert import convert
 from sparsestreet.cli.config.log_from_options import UsageError, compose_data, configured_log, reader_of
 from sparsestreet.data.check import report_check
-from sparsestreet.data.log import split
-from sparsestreet.data.notes import counted
+from sparsestreet.data.log import counted, split
 
 USAGE = """\
 sparsestreet data check DIR [data=nuscenes data.log.scene=scene-0061 data.log.last_frame=50 ...]

@@ -5,10 +5,9 @@ from functools import partial
 from pathlib import Path
 
 from sparsestreet.data.colmap.model import SparseModel, find_model, read_images, read_points
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.marks import Marks
 from sparsestreet.data.posed_images import PosedImages, check_images, recording_of, sort_images, there
 from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing
+from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recording import RecordedReader, Recording
 
 _HELD_OUT = "points of the model were made of all images, of those that are held out too"
@@ -21,7 +20,7 @@ class ColmapReader(RecordedReader):
     The world is the model's. There are no returns and no boxes.
     """
 
-    marks = Marks(
+    marks = FolderSignature(
         tuple(
             f"{place}cameras.{kind}"
             for place in ("", "sparse/0/", "sparse/", "colmap/sparse/0/")

@@ -14,8 +14,8 @@ from jaxtyping import Float64
 from torch import Tensor
 from torch._utils import _rebuild_tensor_v2
 
+from sparsestreet.data.drivestudio.contents import world_from_camera
 from sparsestreet.data.drivestudio.layout import Layout
-from sparsestreet.data.drivestudio.poses import world_from_camera
 from sparsestreet.data.poses import RIGIDITY_TOLERANCE
 from sparsestreet.data.problems import LogError, Problem, fault
 from sparsestreet.geometry import quaternions as quat

@@ -5,27 +5,205 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int
 from torch import Tensor
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.kitti.calibration import Calibration, read_calibration
-from sparsestreet.data.kitti.clock import DriveClock, read_clock, read_turns
-from sparsestreet.data.kitti.contents import Pixels, check_recording
-from sparsestreet.data.kitti.layout import GRAY, Drive, find_drive
-from sparsestreet.data.kitti.oxts import Oxts, read_oxts
-from sparsestreet.data.kitti.tracklets import Tracklet, read_tracklets
-from sparsestreet.data.kitti.velodyne import point_stamps, read_points
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import PosePath, untwisted
-from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
+from sparsestreet.data.images import GivenMasks
+from sparsestreet.data.kitti.files import (
+    GRAY,
+    Calibration,
+    Drive,
+    DriveClock,
+    Pixels,
+    check_recording,
+    elements,
+    find_drive,
+    numbers,
+    point_stamps,
+    read_calibration,
+    read_clock,
+    read_lines,
+    read_points,
+    read_turns,
+)
+from sparsestreet.data.poses import PosePath, check_extent, untwisted
+from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.geometry.cameras import transform_points
+
+EARTH_RADIUS = 6378137.0
+FASTEST, FASTEST_TURN = 150.0, 20.0
+"""m/s and rad/s beyond which no car moves."""
+_MAX_POSE_BYTES = 1 << 16
+_STEPS = 32
+"""Straight parts of the arc of a sweep: at 10 m/s and 0.3 rad/s they miss it by 4 micrometers."""
+_REMEDY_POSE = "copy it again from the published archive, or read other frames (data.log.first_frame, .last_frame)"
+
+
+@dataclass(frozen=True)
+class Oxts:
+    """What the inertial system says of one frame. Its axes are x forward, y left, z up."""
+
+    latitude: float
+    """Degrees."""
+    longitude: float
+    altitude: float
+    rotation: Float64[np.ndarray, "3 3"]
+    """world_from_imu; x east, y north, z up."""
+    velocity: Float64[np.ndarray, "3"]
+    """m/s, in the IMU's axes."""
+    turn: Float64[np.ndarray, "3"]
+    """rad/s about the IMU's axes."""
+
+    @property
+    def mercator_scale(self) -> float:
+        return float(np.cos(np.radians(self.latitude)))
+
+    def world_from_imu(self, scale: float) -> Float64[Tensor, "4 4"]:
+        """Mercator's projection at the scale of the drive's first frame, as the development kit has it:
+        x = s r lon, y = s r ln tan(pi / 4 + lat / 2)."""
+        radius = scale * EARTH_RADIUS
+        north = np.log(np.tan(np.pi * (90 + self.latitude) / 360))
+        pose = torch.eye(4, dtype=torch.float64)
+        pose[:3, :3] = torch.from_numpy(self.rotation)
+        pose[:3, 3] = torch.tensor([radius * np.radians(self.longitude), radius * north, self.altitude])
+        return pose
+
+    def path(self, pose: Float64[Tensor, "4 4"], stamp: int, begin: int, end: int) -> PosePath:
+        """world_from_imu from ``begin`` to ``end``, where it is ``pose`` at ``stamp`` and its motion stays the same.
+
+        The measured motion and not the neighbors' poses: the latter jump by centimeters where GPS corrects them.
+        """
+        twist = torch.zeros(4, 4, dtype=torch.float64)
+        x, y, z = self.turn
+        twist[:3, :3] = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        twist[:3, 3] = torch.from_numpy(self.velocity)
+        stamps = torch.tensor([begin + step * (end - begin) // _STEPS for step in range(_STEPS + 1)])
+        seconds = (stamps - stamp).double() / 1e9
+        return PosePath(stamps, pose @ torch.linalg.matrix_exp(seconds[:, None, None] * twist))
+
+
+def read_oxts(path: Path) -> Oxts:
+    """One frame's file of 30 numbers; raises LogError for a file that is no such thing."""
+    words = " ".join(read_lines(path, _MAX_POSE_BYTES)).split()
+    if len(words) != 30:
+        raise fault(path, f"a frame of GPS and IMU has 30 numbers, this file has {len(words)}", _REMEDY_POSE)
+    values = numbers(words, path, "the file")
+    latitude, longitude, altitude, roll, pitch, yaw, north, east, _, _, up = values[:11]
+    limits = {
+        "latitude": (latitude, 85.0),
+        "longitude": (longitude, 360.0),
+        "altitude": (altitude, 1e4),
+        "angle": (np.abs(values[3:6]).max(), 2 * np.pi + 1e-6),
+        "velocity": (np.abs([north, east, up]).max(), FASTEST),
+        "angular rate": (np.abs(values[17:20]).max(), FASTEST_TURN),
+    }
+    for what, (value, most) in limits.items():
+        if abs(value) > most:
+            raise fault(path, f"the {what} {value:g} is beyond {most:g}, no car's", _REMEDY_POSE)
+    rotation = _rotation(roll, pitch, yaw)
+    return Oxts(latitude, longitude, altitude, rotation, rotation.T @ np.array([east, north, up]), values[17:20])
+
+
+def _rotation(roll: float, pitch: float, yaw: float) -> Float64[np.ndarray, "3 3"]:
+    """Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    return about_z @ about_y @ about_x
+
+
+_MAX_TRACKLETS_BYTES = 1 << 25
+"""Bytes; 15 objects of 100 frames take 0.3 MB."""
+_UNSET = 0
+"""State of a pose that nobody gave."""
+_FARTHEST = 1000.0
+"""Meters."""
+_REMEDY = "copy it again from the published archive, or remove it to read the drive without boxes"
+
+
+@dataclass(frozen=True)
+class Tracklet:
+    """One object: its frames and, at each, its box in the frame of the lidar."""
+
+    class_name: str
+    size: Float64[np.ndarray, "3"]
+    """Length, width, height, meters."""
+    frames: Int[np.ndarray, " f"]
+    lidar_from_object: Float64[Tensor, "f 4 4"]
+    """x along the length, y left, z up, from the center."""
+    num_unset: int
+    """Poses that were left out because nobody gave them."""
+
+
+def read_tracklets(path: Path) -> list[Tracklet]:
+    """In the order of the file; raises LogError with every object at fault."""
+    found, problems, announced = [], [], None
+    for item in elements(path, 2, max_bytes=_MAX_TRACKLETS_BYTES, remedy=_REMEDY):
+        try:
+            if item.tag == "item":
+                found.append(_tracklet(item, path, f"object {len(found) + len(problems)}"))
+            elif item.tag == "count":
+                announced = numbers([item.text or ""], path, "count")[0]
+        except LogError as error:
+            problems += error.problems
+    if not problems and announced != len(found):
+        problems.append(Problem(path, f"it announces {announced} objects and holds {len(found)}", _REMEDY))
+    if problems:
+        raise LogError(problems)
+    return found
+
+
+def _tracklet(item: Element, path: Path, what: str) -> Tracklet:
+    class_name = (item.findtext("objectType") or "").strip()
+    height, width, length, first = _values(item, ("h", "w", "l", "first_frame"), path, what)
+    if not class_name or not (0 <= first < 1e6) or first % 1:
+        message = f"{what} has the class {class_name!r} and the first frame {first:g}"
+        raise fault(path, message, _REMEDY)
+    if min(height, width, length) <= 0 or max(height, width, length) > 100:
+        raise fault(path, f"{what} is {length:g} m long, {width:g} m wide and {height:g} m high", _REMEDY)
+    boxes = item.findall("poses/item")
+    keys = ("tx", "ty", "tz", "rx", "ry", "rz", "state")
+    rows = np.array([_values(box, keys, path, f"{what}, pose {place}") for place, box in enumerate(boxes)])
+    rows = rows.reshape(len(boxes), len(keys))
+    if np.abs(rows[:, :3]).max(initial=0) > _FARTHEST:
+        raise fault(path, f"{what} lies {np.abs(rows[:, :3]).max():g} m away, farther than a lidar sees", _REMEDY)
+    kept = rows[:, 6] != _UNSET
+    poses = _poses(rows[kept], height)
+    frames = int(first) + np.flatnonzero(kept)
+    return Tracklet(class_name, np.array([length, width, height]), frames, poses, int((~kept).sum()))
+
+
+def _poses(rows: Float64[np.ndarray, "f 7"], height: float) -> Float64[Tensor, "f 4 4"]:
+    """From the center of the bottom to that of the box; yaw counts past half a turn, which its sine does not mind."""
+    (x_turn, y_turn, yaw) = rows[:, 3:6].T
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = _about(2, yaw) @ _about(1, y_turn) @ _about(0, x_turn)
+    poses[:, :3, 3] = rows[:, :3] + 0.5 * height * poses[:, :3, 2]
+    return torch.from_numpy(poses)
+
+
+def _about(axis: int, angles: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, "f 3 3"]:
+    """Rotations about x, y or z."""
+    turns = np.tile(np.eye(3), (len(angles), 1, 1))
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    turns[:, first, first] = turns[:, second, second] = np.cos(angles)
+    turns[:, first, second], turns[:, second, first] = -np.sin(angles), np.sin(angles)
+    return turns
+
+
+def _values(item: Element, keys: tuple[str, ...], path: Path, what: str) -> Float64[np.ndarray, " n"]:
+    missing = [key for key in keys if item.find(key) is None]
+    if missing:
+        raise fault(path, f"{what} lacks {', '.join(missing)}", _REMEDY)
+    return numbers([item.findtext(key) or "" for key in keys], path, f"{what} ({', '.join(keys)})")
+
 
 _POSES = "poses are those of GPS and IMU, as shipped: where they err, images and lidar of different frames disagree"
 
@@ -53,7 +231,7 @@ class KittiReader(RecordedReader):
     faced forward, which triggered all four cameras. The world is Mercator's plane: x east, y north, z up.
     """
 
-    marks = Marks(("????_??_??/*_drive_*_sync", "????_??_??/*_drive_*_extract"))
+    marks = FolderSignature(("????_??_??/*_drive_*_sync", "????_??_??/*_drive_*_extract"))
 
     drive: str | int | None = None
     """Such as 2011_09_26_drive_0001; None: the only one."""

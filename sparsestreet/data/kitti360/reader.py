@@ -8,28 +8,60 @@ from statistics import median_low
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
+from PIL import Image
 from torch import Tensor
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.kitti.clock import at_frames, increasing
-from sparsestreet.data.kitti.contents import Masks, Pixels, check_recording
-from sparsestreet.data.kitti.text import read_stamps
-from sparsestreet.data.kitti.velodyne import point_stamps, read_points
-from sparsestreet.data.kitti360.boxes import read_boxes
-from sparsestreet.data.kitti360.fisheye import FisheyeCamera
-from sparsestreet.data.kitti360.layout import FISHEYE, SequenceFolders, find_sequence
-from sparsestreet.data.kitti360.poses import Calibration360, check_pose, read_calibration, read_poses
-from sparsestreet.data.kitti360.semantics import KINDS, read_semantics
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import PosePath, untwisted
-from sparsestreet.data.poses import RIGIDITY_TOLERANCE, are_rigid
-from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
+from sparsestreet.atomic import check_regular
+from sparsestreet.data.images import GivenMasks
+from sparsestreet.data.kitti.files import (
+    Masks,
+    Pixels,
+    at_frames,
+    check_recording,
+    check_size,
+    increasing,
+    point_stamps,
+    read_points,
+    read_stamps,
+)
+from sparsestreet.data.kitti360.files import (
+    FISHEYE,
+    Calibration360,
+    FisheyeCamera,
+    SequenceFolders,
+    check_pose,
+    find_sequence,
+    read_boxes,
+    read_calibration,
+    read_poses,
+)
+from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, untwisted
+from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.cameras import rigidity_error, transform_points
+
+KINDS = {"sky": (23,), "human": (24, 25, 32, 33), "vehicle": (26, 27, 28, 29, 30, 31)}
+"""Class numbers of the label images. Two-wheelers are of the kind human, as in DriveStudio's masks: person, rider,
+motorcycle, bicycle; car, truck, bus, caravan, trailer, train."""
+
+
+def read_semantics(path: Path, recorded_size: tuple[int, int], size: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:
+    """Kind -> mask at (width, height) ``size``, of the nearest pixels; raises LogError for a broken label image."""
+    check_size(path, recorded_size)
+    try:
+        check_regular(path)
+        with Image.open(path) as image:
+            if image.mode not in ("L", "P"):
+                message = f"a label image has one number of 8 bits a pixel, this has the mode {image.mode}"
+                raise fault(path, message, "copy it again from the published archive")
+            labels = np.array(image.resize(size, Image.Resampling.NEAREST))
+    except (OSError, SyntaxError) as error:  # Pillow reports a broken PNG chunk as SyntaxError
+        raise fault(path, f"the labels cannot be decoded ({error})", "copy them again, or remove them") from error
+    return {kind: torch.from_numpy(np.isin(labels, numbers)) for kind, numbers in KINDS.items()}
+
 
 _TURN = 103_300_000
 """Nanoseconds of the lidar's turn, where the stamps of the images do not tell."""
@@ -59,7 +91,7 @@ class Kitti360Reader(RecordedReader):
     frame, for which the images' stamps stand. The world is that of the shipped poses.
     """
 
-    marks = Marks(("data_2d_raw/*_drive_*_sync",))
+    marks = FolderSignature(("data_2d_raw/*_drive_*_sync",))
 
     sequence: int | str | None = None
     """0, 2 to 10 or 18; None: the only one."""

@@ -2,30 +2,265 @@
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
 import torch
+from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles, hash_files
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.nuscenes.boxes import read_boxes
-from sparsestreet.data.nuscenes.cameras import nuscenes_camera, recorded_size
-from sparsestreet.data.nuscenes.instants import Rate
-from sparsestreet.data.nuscenes.pixels import ScenePixels, check_size
-from sparsestreet.data.nuscenes.scene import LIDAR
-from sparsestreet.data.nuscenes.selection import Selection, select
-from sparsestreet.data.nuscenes.sweeps import read_sweep
-from sparsestreet.data.problems import LogError, Problem, attempt, missing_files
+from sparsestreet.atomic import check_regular
+from sparsestreet.data.hood import bottom_rows
+from sparsestreet.data.images import GivenMasks, check_camera_images, image_size, read_image
+from sparsestreet.data.lidar import check_points
+from sparsestreet.data.nuscenes.selection import Rate, Selection, select
+from sparsestreet.data.nuscenes.tables import LIDAR, DataFile, Row, SceneFiles, all_rows, pose_of, rows_of_tokens
+from sparsestreet.data.poses import check_extent
+from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles, hash_files
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
-from sparsestreet.data.rig import RigCamera
+from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.geometry.cameras import transform_points
+
+_LARGEST_SIDE = 1 << 14
+"""Pixels; genuine images have 1600x900."""
+EGO_ROWS = {"CAM_BACK": 80}
+"""Channel -> how many of the lowest rows show the recording car (neurad-studio's nuScenes reader)."""
+_EGO_ROWS_OF_SCENES = {"scene-0164": {"CAM_BACK": 146}}
+_HEIGHT = 900
+"""Rows of the images that these are counted in."""
+
+
+def recorded_size(files: Sequence[DataFile]) -> tuple[int, int]:
+    """(width, height) of a camera's images, as sample_data says. Raises LogError where they differ."""
+    sizes = [(file.row.count("width", _LARGEST_SIDE), file.row.count("height", _LARGEST_SIDE)) for file in files]
+    for file, size in zip(files, sizes, strict=True):
+        if size != sizes[0] or 0 in size:
+            raise file.row.fault("width, height", f"must be positive, and those of the camera, {sizes[0]}", size)
+    return sizes[0]
+
+
+def nuscenes_camera(
+    scene: SceneFiles,
+    name: str,
+    index: int,
+    files: Sequence[DataFile],
+    *,
+    width: int | None,
+    principal_shift: float | int,
+) -> RigCamera[str]:
+    """A pinhole: the publisher has taken the lens out of the images. Raises LogError for broken intrinsics.
+
+    Args:
+        scene: with the calibrations.
+        name: channel.
+        index: place in the log's rig.
+        files: images of the camera, at least one.
+        width: to which images are scaled; None: as recorded.
+        principal_shift: pixels that are added to cx and cy.
+    """
+    intrinsics = [_intrinsics(scene, file) for file in files]
+    for file, one in zip(files, intrinsics, strict=True):
+        if not np.array_equal(one, intrinsics[0]):
+            raise file.row.fault("calibrated_sensor_token", f"must have the intrinsics of all {name}", one.tolist())
+    shifted = torch.from_numpy(intrinsics[0].copy())
+    shifted[:2, 2] += principal_shift
+    return rig_camera(
+        name,
+        index,
+        intrinsics=shifted,
+        distortion=torch.zeros(5, dtype=torch.float64),
+        recorded_size=recorded_size(files),
+        width=width,
+    )
+
+
+def ego_mask(scene: str, camera: RigCamera[str]) -> Bool[Tensor, "h w"] | None:
+    """True where the recording car is seen, at the camera's size; None where it is not."""
+    rows = {**EGO_ROWS, **_EGO_ROWS_OF_SCENES.get(scene, {})}.get(camera.name)
+    return None if rows is None else bottom_rows(camera.size, rows, _HEIGHT)
+
+
+def _intrinsics(scene: SceneFiles, file: DataFile) -> Float64[np.ndarray, "3 3"]:
+    row = scene.calibrations[file.row.text("calibrated_sensor_token")]
+    intrinsics = row.numbers("camera_intrinsic", (3, 3))
+    pinhole = np.array([[intrinsics[0, 0], 0, intrinsics[0, 2]], [0, intrinsics[1, 1], intrinsics[1, 2]], [0, 0, 1]])
+    if not np.array_equal(intrinsics, pinhole) or min(intrinsics[0, 0], intrinsics[1, 1]) <= 0:
+        raise row.fault(
+            "camera_intrinsic", "must be fx 0 cx, 0 fy cy, 0 0 1 with positive fx and fy", intrinsics.tolist()
+        )
+    return intrinsics
+
+
+@dataclass(frozen=True)
+class ScenePixels:
+    """Pixels of shots."""
+
+    rig: Sequence[RigCamera[str]]
+    recorded_sizes: Sequence[tuple[int, int]]
+    """(width, height) of each camera of the rig."""
+    scene: str
+    """Its name."""
+    given: GivenMasks | None
+
+    @property
+    def mask_kinds(self) -> frozenset[str]:
+        ego = frozenset({"ego"} if any(ego_mask(self.scene, camera) is not None for camera in self.rig) else ())
+        return ego if self.given is None else ego | self.given.kinds
+
+    def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
+        path = Path(str(shot.key))
+        check_size(path, self.recorded_sizes[shot.camera])
+        return read_image(path, self.rig[shot.camera].size)
+
+    def masks(self, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
+        """Those that somebody made; the rows of the recording car where they have none of it."""
+        camera = self.rig[shot.camera]
+        ego = ego_mask(self.scene, camera)
+        known = {} if ego is None else {"ego": ego}
+        if self.given is None:
+            return known
+        recorded = self.recorded_sizes[shot.camera]
+        return known | self.given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size)
+
+
+def check_size(path: Path, size: tuple[int, int]) -> None:
+    """Raises LogError unless the image has the size that the tables say."""
+    found = image_size(path)
+    if found != size:
+        message = f"the image is {found[0]}x{found[1]}, sample_data.json says {size[0]}x{size[1]}"
+        raise fault(path, message, "extract the image again from the data set's archive")
+
+
+COLUMNS = 5
+"""float32: x, y, z in meters, intensity, ring."""
+_LARGEST = 100_000_000
+"""Bytes; a genuine sweep of 35,000 returns has 0.7 MB."""
+OWN_CAR = 2.5
+"""Meters from the lidar: nearer returns are of the recording car, or none at all (zeros)."""
+_REMEDY = "extract the file again from the data set's archive, or read the log without lidar (data.log.lidar=false)"
+
+
+def check_sweep_size(path: Path) -> None:
+    """Raises LogError unless the file holds whole rows, of a number that a sweep can have."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise fault(path, f"the sweep cannot be read ({error})", _REMEDY) from error
+    if size % (4 * COLUMNS) or size > _LARGEST:
+        message = f"{size} bytes are no whole number of rows of {COLUMNS} float32, or more than {_LARGEST}"
+        raise fault(path, message, _REMEDY)
+
+
+def read_sweep(path: Path, world_from_lidar: Float64[Tensor, "4 4"]) -> Float64[Tensor, "n 3"]:
+    """Points in nuScenes' world, without those of the recording car.
+
+    The publisher has moved them by the car's own motion to the sweep's stamp. Raises LogError for a broken file.
+    """
+    check_sweep_size(path)
+    try:
+        check_regular(path)
+        rows = np.fromfile(path, dtype="<f4").reshape(-1, COLUMNS)
+    except OSError as error:
+        raise fault(path, f"the sweep cannot be read ({error})", _REMEDY) from error
+    points = torch.from_numpy(rows[:, :3].astype(np.float64))
+    check_points(points, path, remedy=_REMEDY)
+    return transform_points(world_from_lidar, points[points.norm(dim=1) >= OWN_CAR])
+
+
+_LENGTH_WIDTH_HEIGHT = [1, 0, 2]
+"""Places in nuScenes' width, length, height."""
+
+
+def read_boxes(
+    scene: SceneFiles, annotations: Sequence[Row], of_samples: Mapping[int, int]
+) -> tuple[list[Boxes], tuple[str, ...]]:
+    """Every object of the scene that some return hit, with all its boxes; and what should be known of the others.
+
+    A box without returns is one that annotators placed between boxes with returns: the object is hidden there, not
+    gone. An object without any return is a guess, and left out. Without lidar nobody can tell, and all are kept.
+
+    Args:
+        scene: whose samples the boxes are of.
+        annotations: of the scene.
+        of_samples: place of a sample -> the frame that its boxes belong to; boxes of other samples are left out.
+    """
+    objects: dict[str, list[Row]] = {}
+    for row in annotations:
+        objects.setdefault(row.text("instance_token"), []).append(row)
+    without_lidar = LIDAR not in scene.files
+    seen = {token: rows for token, rows in objects.items() if without_lidar or any(map(_returns, rows))}
+    classes = _classes(scene, seen)
+    boxes = [_boxes(scene, token, classes[token], rows, of_samples) for token, rows in seen.items()]
+    return boxes, tuple(_notes(scene, seen, len(objects) - len(seen)))
+
+
+def _returns(row: Row) -> int:
+    """Lidar and radar returns in a box."""
+    return row.count("num_lidar_pts") + row.count("num_radar_pts")
+
+
+def _classes(scene: SceneFiles, objects: Mapping[str, object]) -> dict[str, str]:
+    """Instance -> the name of its category."""
+    instances = rows_of_tokens(scene.tables / "instance.json", set(objects))
+    tokens = {row.text("category_token") for row in instances.values()}
+    categories = rows_of_tokens(scene.tables / "category.json", tokens)
+    return {token: categories[row.text("category_token")].text("name") for token, row in instances.items()}
+
+
+def _boxes(scene: SceneFiles, token: str, category: str, rows: Sequence[Row], of_samples: Mapping[int, int]) -> Boxes:
+    by_sample: dict[int, Row] = {}
+    for row in rows:
+        place = scene.places[row.text("sample_token")]
+        if by_sample.setdefault(place, row) is not row:
+            raise row.fault("instance_token", "must have one box a sample", token)
+    places = [place for place in sorted(by_sample) if place in of_samples]
+    sizes = np.array([_size(by_sample[place]) for place in places]).reshape(-1, 3)
+    poses = [pose_of(by_sample[place]).numpy() for place in places]
+    return Boxes(
+        name=token,
+        class_name=category,
+        frames=np.array([of_samples[place] for place in places], np.int64),
+        poses=np.array(poses).reshape(-1, 4, 4),
+        sizes=sizes,
+        path=scene.tables / "sample_annotation.json",
+        stamps=tuple(scene.sample_stamps[place] for place in places),
+    )
+
+
+def _size(row: Row) -> Float64[np.ndarray, "3"]:
+    """Length, width, height, meters."""
+    size = row.numbers("size", (3,))
+    if not (size > 0).all():
+        raise row.fault("size", "must be a positive width, length and height", size.tolist())
+    return size[_LENGTH_WIDTH_HEIGHT]
+
+
+def _notes(scene: SceneFiles, objects: Mapping[str, Sequence[Row]], unseen: int) -> list[str]:
+    rows = [row for boxes in objects.values() for row in boxes]
+    notes = []
+    if unseen:
+        notes.append(f"{unseen} objects that no lidar or radar return hit at any keyframe are left out")
+    if LIDAR in scene.files and (hidden := sum(not _returns(row) for row in rows)):
+        notes.append(f"{hidden} of {len(rows)} boxes hold no return: their objects are hidden then, and are kept")
+    names = {row.token: row.text("name") for row in all_rows(scene.tables / "attribute.json")}
+    counts = Counter(names.get(token, "?") for row in rows for token in _attributes(row))
+    if counts:
+        said = ", ".join(f"{name} {count}" for name, count in sorted(counts.items()))
+        notes.append(f"attributes of the boxes are not used, displacement tells what moves: {said}")
+    return notes
+
+
+def _attributes(row: Row) -> list[str]:
+    tokens = row.values.get("attribute_tokens")
+    if not isinstance(tokens, list) or not all(isinstance(token, str) for token in tokens):
+        raise row.fault("attribute_tokens", "must be a list of tokens", tokens)
+    return tokens
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +271,7 @@ class NuScenesReader(RecordedReader):
     stamp. Lidar points are where they were at the end of a turn. Boxes are those of the samples, at their stamps.
     """
 
-    marks = Marks(("*/sample_data.json",))
+    marks = FolderSignature(("*/sample_data.json",))
 
     scene: str | int | None = None
     """Its name, as "scene-0061"; or its place in scene.json, from 0, as DriveStudio counts; None: the only one."""

@@ -1,7 +1,7 @@
 """From the files of a sequence to a recording."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -10,20 +10,159 @@ import torch
 from jaxtyping import Bool, Float64, UInt8
 from torch import Tensor
 
-from sparsestreet.data.ego import bottom_rows
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import image_size, read_image
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.pandaset.boxes import Objects, read_objects
-from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR, EGO_ROWS, FRONT, USUAL_CAMERAS, Layout, find_sequence
-from sparsestreet.data.pandaset.spin import Spin, spin_of
-from sparsestreet.data.pandaset.tables import PER_SECOND, read_intrinsics, read_poses, read_returns, read_stamps
-from sparsestreet.data.problems import LogError, Problem, fault, missing_files
-from sparsestreet.data.recording import LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.hood import bottom_rows
+from sparsestreet.data.images import GivenMasks, image_size, read_image
+from sparsestreet.data.pandaset.tables import (
+    CAMERA_FROM_LIDAR,
+    EGO_ROWS,
+    FRONT,
+    PER_SECOND,
+    USUAL_CAMERAS,
+    Cuboids,
+    Layout,
+    find_sequence,
+    read_cuboids,
+    read_intrinsics,
+    read_poses,
+    read_returns,
+    read_stamps,
+)
+from sparsestreet.data.poses import check_extent
+from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
-from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.geometry.cameras import inverse, transform_points
+
+_SURE = 0.9
+"""Mean length of the unit vectors whose direction is the phase, of 1 for a lidar that turns evenly."""
+
+
+@dataclass(frozen=True)
+class Spin:
+    """An even turn of a lidar: azimuth over time."""
+
+    period: float
+    """Seconds."""
+    direction: int
+    """1: counterclockwise seen from above, -1: clockwise."""
+    phase: float
+    """Radians: 2 pi t / period = direction * azimuth + phase, but for whole turns."""
+    middle: float
+    """Seconds from the stamp of a sweep to the middle of its turn."""
+
+    def passing(self, azimuths: np.ndarray) -> np.ndarray:
+        """Seconds from the stamp of the sweep to the instants at which the beam has these azimuths (radians)."""
+        since = self.direction * azimuths + self.phase - 2 * np.pi * self.middle / self.period
+        return self.middle + self.period * ((since / (2 * np.pi) + 0.5) % 1 - 0.5)
+
+
+def spin_of(azimuths: np.ndarray, seconds: np.ndarray, period: float) -> Spin | None:
+    """The turn that returns show: which way, and when ahead; None where they show none.
+
+    Args:
+        azimuths: of the returns in the frame of the lidar, radians.
+        seconds: from the stamp of the sweep to each return.
+        period: seconds of a turn.
+    """
+    # Points of another data set, written in this one's layout, are where they were at one instant.
+    if not len(azimuths) or seconds.min() == seconds.max():
+        return None
+    middle = (seconds.min() + seconds.max()) / 2
+    turns = 2 * np.pi * seconds / period
+    sums = {direction: np.exp(1j * (turns - direction * azimuths)).mean() for direction in (1, -1)}
+    direction = max(sums, key=lambda one: abs(sums[one]))
+    if abs(sums[direction]) < _SURE:
+        return None
+    return Spin(period, direction, float(np.angle(sums[direction])), float(middle))
+
+
+@dataclass(frozen=True)
+class Objects:
+    """What the cuboids of a window are."""
+
+    boxes: list[Boxes]
+    stationary: int
+    """How many objects stand through all of the scene."""
+    twins: int
+    """Cuboids left out because another is of the same object at the same instant."""
+    crowded: int
+    """Cuboids left out because the one before is not earlier."""
+
+
+@dataclass(frozen=True)
+class _Object:
+    label: str
+    stationary: bool
+    frames: list[int] = field(default_factory=list)
+    stamps: list[int] = field(default_factory=list)
+    poses: list[np.ndarray] = field(default_factory=list)
+    sizes: list[np.ndarray] = field(default_factory=list)
+
+
+def read_objects(
+    layout: Layout,
+    frames: Sequence[int],
+    stamps: Sequence[int],
+    world_from_lidar: Float64[Tensor, "f 4 4"],
+    spin: Spin | None,
+) -> Objects:
+    """The objects of a window; raises LogError with all files that are broken.
+
+    Args:
+        layout: the sequence.
+        frames: of the window, as files are numbered.
+        stamps: of the sweeps of the window.
+        world_from_lidar: at these stamps.
+        spin: when the lidar passed a direction, which is when a box was where it is; None: at the stamp of its sweep.
+    """
+    objects: dict[str, _Object] = {}
+    problems: list[Problem] = []
+    twins = crowded = 0
+    for index, frame in enumerate(frames):
+        cuboids = attempt(problems, _reading(layout, frame))
+        if cuboids is None:
+            continue
+        twins += cuboids.twins
+        moments = stamps[index] + _delays(cuboids, world_from_lidar[index], spin)
+        for row, name in enumerate(cuboids.names):
+            one = objects.setdefault(name, _Object(cuboids.labels[row], bool(cuboids.stationary[row])))
+            if one.stamps and moments[row] <= one.stamps[-1]:
+                crowded += 1
+                continue
+            one.frames.append(index)
+            one.stamps.append(int(moments[row]))
+            one.poses.append(cuboids.poses[row])
+            one.sizes.append(cuboids.sizes[row])
+    if problems:
+        raise LogError(problems)
+    boxes = [_boxes(layout, name, one) for name, one in objects.items()]
+    return Objects(boxes, sum(one.stationary for one in objects.values()), twins, crowded)
+
+
+def _reading(layout: Layout, frame: int) -> Callable[[], Cuboids]:
+    return lambda: read_cuboids(layout.boxes(frame))
+
+
+def _delays(cuboids: Cuboids, world_from_lidar: Float64[Tensor, "4 4"], spin: Spin | None) -> np.ndarray:
+    """Nanoseconds from the stamp of the sweep to the moment of each box; 0 for those of the other lidar."""
+    if spin is None or not cuboids.names:
+        return np.zeros(len(cuboids.names), dtype=np.int64)
+    centers = transform_points(inverse(world_from_lidar), torch.from_numpy(cuboids.poses[:, :3, 3])).numpy()
+    seconds = spin.passing(np.arctan2(centers[:, 1], centers[:, 0]))
+    return np.where(cuboids.spinning, np.round(seconds * PER_SECOND), 0).astype(np.int64)
+
+
+def _boxes(layout: Layout, name: str, one: _Object) -> Boxes:
+    return Boxes(
+        name=name,
+        class_name=one.label,
+        frames=np.array(one.frames),
+        poses=np.stack(one.poses),
+        sizes=np.stack(one.sizes),
+        path=layout.cuboids,
+        stamps=tuple(one.stamps),
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +173,7 @@ class PandaSetReader(RecordedReader):
     as pinholes whose rows are exposed at once; the data set declares neither lens nor shutter.
     """
 
-    marks = Marks(("camera/front_camera/poses.json",), depth=2)
+    marks = FolderSignature(("camera/front_camera/poses.json",), depth=2)
 
     scene: str | int | None = None
     """Name of the sequence, "001" or 1; None: the only one below the root."""

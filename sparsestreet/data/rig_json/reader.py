@@ -1,30 +1,276 @@
 """From ``rig.json`` and the files that it names to a recording."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
-from sparsestreet.data.images import check_camera_images, check_image_sizes
-from sparsestreet.data.lidar import empty_notes
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_files, missing_notes
-from sparsestreet.data.recording import RecordedImage, RecordedReader, Recording
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, UInt8
+from torch import Tensor
+
+from sparsestreet.atomic import check_regular
+from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_image, read_mask
+from sparsestreet.data.lidar import check_points, empty_notes, returned
+from sparsestreet.data.ply import read_ply
+from sparsestreet.data.poses import PosePath, check_extent, untwisted
+from sparsestreet.data.problems import (
+    LogError,
+    Missing,
+    Problem,
+    attempt,
+    check_missing,
+    fault,
+    missing_files,
+    missing_notes,
+)
+from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
-from sparsestreet.data.rig_json.part import Part, entry_of, read_masks, read_pixels
-from sparsestreet.data.rig_json.sweeps import read_rows
-from sparsestreet.data.rig_json.table import read_table, with_files
-from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.data.rig_json.table import (
+    CameraEntry,
+    FrameEntry,
+    ImageEntry,
+    LidarEntry,
+    RigTable,
+    read_table,
+    with_files,
+)
+from sparsestreet.geometry.cameras import transform_points
+from sparsestreet.types import Shutter
+
+_BIN = ("x", "y", "z", "intensity")
+_LONGEST_SWEEP = 1.0
+"""Seconds around its stamp in which a point may have been measured."""
+
+
+def read_sweep(
+    path: Path, frame: FrameEntry, lidar: LidarEntry, drive: PosePath | None, reference: Float64[Tensor, "3"]
+) -> Float64[Tensor, "n 3"]:
+    """Points in the world.
+
+    Args:
+        path: the file.
+        frame: whose sweep it is.
+        lidar: how it is written.
+        drive: world_from_vehicle over time; None: without a clock.
+        reference: a place near the lidar, in the world.
+
+    Raises LogError for a file that is missing or holds anything else.
+    """
+    points, times = read_rows(path, lidar.columns)
+    # Who writes the world's points moves a driver's zeros to the sensor, or leaves them.
+    some = returned(points)
+    points, times = points[some], None if times is None else times[some]
+    mount = lidar.vehicle_from_lidar
+    check_points(points - reference if mount is None else points, path)
+    center = reference if mount is None else torch.zeros(3, dtype=torch.float64)
+    far = ((points - center).norm(dim=-1) >= lidar.nearest) & returned(points - center)
+    points = points[far]
+    if mount is None:
+        return points
+    points = transform_points(mount, points)
+    stamp = frame.stamp if frame.sweep_stamp is None else frame.sweep_stamp
+    if stamp is None or drive is None:
+        assert frame.world_from_vehicle is not None  # the reader has looked
+        return transform_points(frame.world_from_vehicle, points)
+    try:
+        if times is None:
+            return transform_points(drive.at(torch.tensor([stamp]))[0], points)
+        return untwisted(points, stamp + (1e9 * times[far]).round().long(), drive)
+    except ValueError as error:
+        raise fault(path, str(error), "leave out what was measured outside of the drive") from error
+
+
+def read_rows(
+    path: Path, columns: tuple[str, ...] | None
+) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, " n"] | None]:
+    """Points as they are written, and their seconds behind the stamp of the sweep where ``columns`` have a time."""
+    if path.suffix == ".ply":
+        return read_ply(path)[0], None
+    if path.suffix not in (".bin", ".npy"):
+        raise fault(path, f"points of the ending {path.suffix!r} are not read", "write .bin, .npy or .ply")
+    rows = _binary(path, columns or _BIN) if path.suffix == ".bin" else _array(path, columns)
+    names = columns or _BIN[:3]
+    points = np.stack([rows[:, names.index(axis)] for axis in "xyz"], 1).astype(np.float64)
+    if "time" not in names:
+        return torch.from_numpy(points), None
+    times = torch.from_numpy(rows[:, names.index("time")].astype(np.float64))
+    if not (times.abs() <= _LONGEST_SWEEP).all():
+        message = f"times must lie within {_LONGEST_SWEEP:g} s of the sweep's stamp"
+        raise fault(path, message, "write seconds behind the stamp")
+    return torch.from_numpy(points), times
+
+
+def _binary(path: Path, columns: tuple[str, ...]) -> np.ndarray:
+    if not path.is_file():
+        raise fault(path, "the file is missing", "write it, or leave out the frame's lidar")
+    if path.stat().st_size % (4 * len(columns)):
+        message = f"{path.stat().st_size} bytes are no whole number of rows of {len(columns)} float32"
+        raise fault(path, message, f"write rows of {', '.join(columns)}, or name the columns in lidar.columns")
+    check_regular(path)
+    return np.fromfile(path, dtype="<f4").reshape(-1, len(columns))
+
+
+def _array(path: Path, columns: tuple[str, ...] | None) -> np.ndarray:
+    """Mapped, so that a header cannot ask for memory that the file does not fill."""
+    try:
+        rows = np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # numpy's parser of headers raises whatever Python's own does
+        raise fault(path, f"the file is no array ({str(error)[:80]})", "write it by numpy.save") from error
+    wanted = "at least 3" if columns is None else str(len(columns))
+    fits = rows.ndim == 2 and (rows.shape[1] >= 3 if columns is None else rows.shape[1] == len(columns))
+    if not fits or rows.dtype.kind not in "fiu":
+        message = f"the array is {rows.dtype} of {rows.shape}, not numbers in rows of {wanted}"
+        raise fault(path, message, "write a row a point: x, y, z and whatever lidar.columns names")
+    return rows
+
+
+_PER_SECOND = 1e9
+
+
+@dataclass(frozen=True)
+class Part:
+    """The chosen cameras and frames of a table."""
+
+    table: RigTable
+    cameras: Sequence[str]
+    places: Sequence[int]
+    """Of the frames in the table: those of the window with an image of these cameras."""
+
+    @property
+    def frames(self) -> list[FrameEntry]:
+        return [self.table.frames[place] for place in self.places]
+
+    @property
+    def stamps(self) -> tuple[int, ...] | None:
+        """None: there is no clock."""
+        return tuple(frame.stamp for frame in self.frames if frame.stamp is not None) or None
+
+    @property
+    def vehicle(self) -> PosePath | None:
+        """At the frames of the window; None: without a clock, or without poses."""
+        return _drive(self.frames)
+
+    def shots(self) -> list[RecordedImage]:
+        drive = _drive(self.table.frames)
+        return [
+            _shot(self.table, drive, entry, frame, index, name)
+            for frame, entry in enumerate(self.frames)
+            for index, name in enumerate(self.cameras)
+            if name in entry.images
+        ]
+
+    def sweeps(self, shots: Sequence[RecordedImage]) -> dict[int, LidarSweep] | None:
+        """Of the frames that have one; None: no frame of the table has."""
+        if not any(frame.sweep for frame in self.table.frames):
+            return None
+        drive = _drive(self.table.frames)
+        near = {shot.frame: shot.world_from_camera[:3, 3] for shot in reversed(shots)}
+        sweeps = {}
+        for index, frame in enumerate(self.frames):
+            if frame.sweep is not None:
+                stamp = frame.stamp if frame.sweep_stamp is None else frame.sweep_stamp
+                reference = near[index] if frame.world_from_vehicle is None else frame.world_from_vehicle[:3, 3]
+                read = partial(read_sweep, frame.sweep, frame, self.table.lidar, drive, reference)
+                sweeps[index] = LidarSweep(read, stamp)
+        return sweeps
+
+    def boxes(self) -> list[Boxes] | None:
+        """Objects with a box in these frames, in their count."""
+        if self.table.boxes is None:
+            return None
+        index = {place: index for index, place in enumerate(self.places)}
+        found = []
+        for box in self.table.boxes:
+            rows = [row for row, place in enumerate(box.frames.tolist()) if place in index]
+            if rows:
+                frames = np.array([index[place] for place in box.frames[rows].tolist()])
+                stamps = None if box.stamps is None else tuple(box.stamps[row] for row in rows)
+                found.append(replace(box, frames=frames, poses=box.poses[rows], sizes=box.sizes[rows], stamps=stamps))
+        return found
+
+
+def _shot(
+    table: RigTable, drive: PosePath | None, entry: FrameEntry, frame: int, index: int, name: str
+) -> RecordedImage:
+    image, mount = entry.images[name], table.cameras[name].vehicle_from_camera
+    stamp = entry.stamp if image.stamp is None else image.stamp
+    pose = image.world_from_camera
+    if pose is None:
+        if mount is None or entry.world_from_vehicle is None:
+            raise image.where.fault("has no pose", "write world_from_camera")  # read_table has looked
+        pose = entry.world_from_vehicle @ mount
+        if stamp is not None and stamp != entry.stamp and drive is not None:
+            try:
+                pose = drive.at(torch.tensor([stamp]))[0] @ mount
+            except ValueError as error:
+                remedy = "give the image its own world_from_camera, or the frames poses around it"
+                raise image.where.fault(f"has no pose: {error}", remedy) from error
+    shutter = _shutter(table.cameras[name], drive, image, stamp)
+    exposure = table.cameras[name].exposure
+    return RecordedImage(frame, index, pose, image, image.path.stem, stamp, shutter, exposure)
+
+
+def _shutter(camera: CameraEntry, drive: PosePath | None, image: ImageEntry, stamp: int | None) -> Shutter | None:
+    """The camera's motion on the vehicle's path while the image is read out; None: it is exposed at once."""
+    if not camera.readout:
+        return None
+    if drive is None or stamp is None or camera.vehicle_from_camera is None:
+        remedy = "write stamps and world_from_vehicle of the frames and the camera's mount, or leave out its shutter"
+        raise image.where.fault("has a shutter, but nothing tells how the camera moves", remedy)
+    path = replace(drive, poses=drive.poses @ camera.vehicle_from_camera)
+    try:
+        return Shutter(*path.motion_during(stamp, camera.readout), camera.side, camera.readout / _PER_SECOND)
+    except ValueError as error:
+        remedy = "give the frames poses around it, or leave the image out"
+        raise image.where.fault(f"is read out where no pose is known: {error}", remedy) from error
+
+
+def _drive(frames: Sequence[FrameEntry]) -> PosePath | None:
+    """Where the vehicle is over time, and a frame's step beyond; None: without a clock, or without poses."""
+    known = [
+        (frame.stamp, frame.world_from_vehicle)
+        for frame in frames
+        if frame.stamp is not None and frame.world_from_vehicle is not None
+    ]
+    if not known:
+        return None
+    stamps = [stamp for stamp, _ in known]
+    step = (stamps[-1] - stamps[0]) // max(len(stamps) - 1, 1)
+    return PosePath(torch.tensor(stamps), torch.stack([pose for _, pose in known]), max_extrapolation=step)
+
+
+def read_pixels(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
+    camera = rig[shot.camera]
+    return read_image(entry_of(shot).path, camera.size, camera.undistortion)
+
+
+def read_masks(
+    table: RigTable, rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: RecordedImage
+) -> dict[str, Bool[Tensor, "h w"]]:
+    camera = rig[shot.camera]
+    entry, lens = table.cameras[camera.name], camera.undistortion
+    masks: dict[str, Bool[Tensor, "h w"]] = {}
+    if given is not None:
+        masks = given.read(camera.name, shot.stem, recorded_size=entry.size, size=camera.size, undistortion=lens)
+    if entry.ego_mask is not None:
+        ego = read_mask(entry.ego_mask, camera.size, sky=False, undistortion=lens)
+        masks["ego"] = masks["ego"] | ego if "ego" in masks else ego
+    return masks
+
+
+def entry_of(shot: RecordedImage) -> ImageEntry:
+    assert isinstance(shot.key, ImageEntry)
+    return shot.key
 
 
 @dataclass(frozen=True, kw_only=True)
 class RigJsonReader(RecordedReader):
     """A folder with a ``rig.json`` that somebody wrote by hand (docs/datasets/rig_json.md)."""
 
-    marks = Marks(("rig.json",))
+    marks = FolderSignature(("rig.json",))
 
     pinhole_fov: float | None = None
     """Degrees that the pinhole of a lens that is not simulated sees from left to right; None: its resolution is that of

@@ -1,12 +1,148 @@
-"""First hits of ray bundles, and shadow rays towards the sun."""
+"""Parts of the street, the scene that they make up, and the rays that meet it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int16
+from jaxtyping import Bool, Float32, Float64, Int, Int16
 
-from sparsestreet.data.synthetic.scene import Scene, SunView
-from sparsestreet.data.synthetic.shapes import Vectors, rotated
+from sparsestreet.data.synthetic.shapes import Capsule, Shape, Vectors, rotated
+from sparsestreet.data.synthetic.textures import Surface
+
+BACKGROUND = -1
+"""Object index of parts that belong to no annotated object."""
+
+Pose = Float64[np.ndarray, "4 4"]
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Part:
+    shape: Shape
+    surface: Surface
+    frame_from_part: Pose
+    """The frame is the object's while a model is built, and the world once the part stands in the street."""
+    object_index: int = BACKGROUND
+
+
+def placed(parts: list[Part], world_from_object: Pose, object_index: int = BACKGROUND) -> list[Part]:
+    """Returns the parts of an object, moved to the world."""
+    return [
+        replace(part, frame_from_part=world_from_object @ part.frame_from_part, object_index=object_index)
+        for part in parts
+    ]
+
+
+def at(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
+    """Returns a pose at a position, turned by ``yaw`` radians about z.
+
+    >>> at(1.0, 2.0, 0.0)[:3, 3].tolist()
+    [1.0, 2.0, 0.0]
+    """
+    pose = np.eye(4)
+    pose[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def axis_along_y(x: float, y: float, z: float) -> Pose:
+    """Returns a pose whose z axis is the frame's y axis, as for wheels on an axle."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def limb(start: Point, end: Point, radius: float, surface: Surface) -> Part:
+    """Returns a capsule whose axis runs from one point to another, meters."""
+    a, b = np.array(start, np.float64), np.array(end, np.float64)
+    length = float(np.linalg.norm(b - a))
+    axis = (b - a) / length
+    helper = np.array([1.0, 0, 0]) if abs(axis[0]) < 0.9 else np.array([0, 1.0, 0])
+    side = np.cross(helper, axis)
+    side /= np.linalg.norm(side)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack((np.cross(side, axis), side, axis), axis=1)
+    pose[:3, 3] = (a + b) / 2
+    return Part(Capsule(radius, length / 2.0), surface, pose)
+
+
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float32)
+_MARGIN = np.float32(5e-3)
+"""Slack of all culling tests, meters: float32 rounds 250 m by 1.5e-5, and products of three such terms by less."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    parts: tuple[Part, ...]
+    rotations: Float32[np.ndarray, "p 3 3"]
+    """World from part."""
+    centers: Float32[np.ndarray, "p 3"]
+    half_extents: Float32[np.ndarray, "p 3"]
+    corners: Float32[np.ndarray, "p 8 3"]
+    """Corners of the bounding boxes, world frame."""
+    half_axes: Float32[np.ndarray, "p 3 3"]
+    """Columns are vectors from the center of each bounding box to the middle of its faces, world frame, meters."""
+    object_indices: Int[np.ndarray, " p"]
+
+    @staticmethod
+    def of(parts: list[Part]) -> "Scene":
+        poses = np.stack([part.frame_from_part for part in parts])
+        half = np.stack([part.shape.half_extent for part in parts]).astype(np.float32)
+        rotations = np.ascontiguousarray(poses[:, :3, :3], np.float32)
+        centers = np.ascontiguousarray(poses[:, :3, 3], np.float32)
+        corners = centers[:, None] + (_SIGNS * half[:, None]) @ rotations.transpose(0, 2, 1)
+        objects = np.array([part.object_index for part in parts], np.int16)
+        return Scene(tuple(parts), rotations, centers, half, corners, rotations * half[:, None], objects)
+
+    def to_part(self, index: int, points: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "3 m"]:
+        """Returns world points in the frame of a part."""
+        return rotated(self.rotations[index].T, points - self.centers[index][:, None])
+
+    def turn_to_part(self, index: int, directions: Vectors) -> Vectors:
+        return rotated(self.rotations[index].T, directions)
+
+    def turn_to_world(self, index: int, directions: Vectors) -> Vectors:
+        return rotated(self.rotations[index], directions)
+
+    def distances(self, origin: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, " p"]:
+        """Returns a lower bound of the distance from a point to each part, meters."""
+        local = np.einsum("pji,pj->pi", self.rotations, origin - self.centers)
+        return np.linalg.norm(np.maximum(np.abs(local) - self.half_extents, 0), axis=1)
+
+    def in_bundle(
+        self, among: Int[np.ndarray, " c"], origin: Float32[np.ndarray, "3"], planes: Float32[np.ndarray, "k 3"]
+    ) -> Int[np.ndarray, " d"]:
+        """Returns the parts that lie wholly outside none of the planes through ``origin`` (normals point inwards)."""
+        # The support function of a box is the reach of its farthest corner along each normal.
+        reach = np.abs(planes @ self.half_axes[among]).sum(2)
+        heights = (self.centers[among] - origin) @ planes.T + reach
+        return among[(heights >= -_MARGIN).all(1)]
+
+
+@dataclass(frozen=True)
+class SunView:
+    """The scene as the sun sees it, projected to a plane in which every shadow ray is a point."""
+
+    sun: Float32[np.ndarray, "3"]
+    axes: Float32[np.ndarray, "3 3"]
+    """Rows are two axes across the sunlight, and the direction towards the sun."""
+    low: Float32[np.ndarray, "p 3"]
+    high: Float32[np.ndarray, "p 3"]
+
+    @staticmethod
+    def of(scene: Scene, sun: Float32[np.ndarray, "3"]) -> "SunView":
+        side = np.cross(sun, np.array([0, 0, 1], np.float32))
+        side /= np.linalg.norm(side)
+        axes = np.stack((side, np.cross(sun, side), sun)).astype(np.float32)
+        seen = scene.corners @ axes.T
+        return SunView(sun, axes, seen.min(1) - _MARGIN, seen.max(1) + _MARGIN)
+
+    def blockers(self, seen: Vectors) -> Int[np.ndarray, " c"]:
+        """Returns parts that may lie between the sun and some of the points, which are in this view's coordinates."""
+        low, high = seen.min(1), seen.max(1)
+        beside = (self.low[:, :2] > high[:2]) | (self.high[:, :2] < low[:2])
+        return np.flatnonzero(~beside.any(1) & (self.high[:, 2] > low[2]))
+
 
 NOTHING = np.int16(-1)
 """Part index of a ray that leaves the street."""

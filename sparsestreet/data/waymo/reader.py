@@ -1,5 +1,6 @@
 """From a segment of Waymo's Open Dataset to a recording."""
 
+import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -8,26 +9,202 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64, UInt8
+from PIL import Image
 from torch import Tensor
 
-from sparsestreet.data.extent import check_extent
-from sparsestreet.data.fingerprint import LogFiles
-from sparsestreet.data.given_masks import GivenMasks
+from sparsestreet.data.images import GivenMasks, colors
 from sparsestreet.data.lidar import check_points
-from sparsestreet.data.marks import Marks
-from sparsestreet.data.motion import PosePath
+from sparsestreet.data.poses import PosePath, check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
+from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
-from sparsestreet.data.waymo.boxes import read_boxes
-from sparsestreet.data.waymo.find import find_segment
-from sparsestreet.data.waymo.images import camera_at, middle, shutter
-from sparsestreet.data.waymo.lidar import SPIN, check_returns, world_points
-from sparsestreet.data.waymo.notes import segment_notes
-from sparsestreet.data.waymo.pixels import decode_image, decode_masks
-from sparsestreet.data.waymo.segment import REMEDY, ImageMotion, Segment
-from sparsestreet.data.waymo.spool import Spool
-from sparsestreet.data.window import chosen_cameras, frame_window
+from sparsestreet.data.waymo.boxes import camera_at, middle, read_boxes, shutter
+from sparsestreet.data.waymo.segment import (
+    REMEDY,
+    SPIN,
+    ImageMotion,
+    Segment,
+    Spool,
+    canonical,
+    check_returns,
+    world_points,
+)
+from sparsestreet.data.waymo.v1.segment import RecordSegment
+from sparsestreet.data.waymo.v2 import TableSegment
+
+_COMPONENTS = ("vehicle_pose", "camera_image", "camera_calibration", "lidar", "lidar_box")
+_RECORDS = ("*.tfrecord", "*/*.tfrecord", "*/*/*.tfrecord")
+_LARGEST_INDEX = 10**6
+"""A number above is no place in a list but a name: Hydra takes the digits and underscores of one for a number."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The segments of a folder, by name: files of version 1, folders of components of version 2."""
+
+    version: int
+    places: Mapping[str, Path]
+
+
+def find_segments(root: Path) -> Found:
+    """Raises LogError for a folder that holds segments of neither version, or of both."""
+    if not root.is_dir():
+        raise fault(root, "there is no such folder", "name the folder that holds Waymo's files (data.root)")
+    records = {canonical(path.name): path for pattern in _RECORDS for path in sorted(root.glob(pattern))}
+    tables = {
+        canonical(path.name): path.parent.parent
+        for component in _COMPONENTS
+        for pattern in (f"{component}/*.parquet", f"*/{component}/*.parquet")
+        for path in sorted(root.glob(pattern))
+    }
+    if records and tables:
+        message = f"it holds {len(records)} segments of version 1 (.tfrecord) and {len(tables)} of version 2 (.parquet)"
+        raise fault(root, message, "name the folder of one of them (data.root)")
+    if not records and not tables:
+        message = "it holds neither *.tfrecord (version 1) nor component/*.parquet (version 2), up to two folders deep"
+        raise fault(root, message, "name the folder that holds Waymo's files (data.root)")
+    return Found(1, records) if records else Found(2, tables)
+
+
+def find_segment(root: Path, scene: str | int | None, scenes: Path | None) -> Segment:
+    """The wanted segment, opened.
+
+    Args:
+        root: of the files.
+        scene: name of a segment, or its place in ``scenes``, from 0; None: the only one.
+        scenes: a file with the name of a segment a line.
+
+    Raises LogError for files at fault, ValueError for a scene that is not there.
+    """
+    found = find_segments(root)
+    name = _wanted(found, scene, scenes, root)
+    place = found.places[name]
+    return RecordSegment(place) if found.version == 1 else TableSegment(place, name)
+
+
+def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Path) -> str:
+    names = sorted(found.places)
+    shown = listed(names)
+    if scene is None:
+        if len(names) > 1:
+            raise ValueError(f"data.log.scene must name one of the segments in {root}: {shown}")
+        return names[0]
+    if isinstance(scene, int) and scene <= _LARGEST_INDEX:
+        scene = _at_place(scene, scenes, shown)
+    if isinstance(scene, int):
+        name = next((name for name in names if name.replace("_", "") == str(scene)), str(scene))
+    else:
+        name = canonical(scene)
+    if name not in found.places:
+        raise ValueError(f"segment {name} is not in {root}: data.log.scene must be one of {shown}")
+    return name
+
+
+def _at_place(place: int, scenes: Path | None, shown: str) -> str:
+    """The line of a list of names."""
+    if scenes is None:
+        message = f"data.log.scene={place} is a place in a list of segments: name the list (data.log.scenes)"
+        raise ValueError(f"{message}, or one of the segments {shown}")
+    try:
+        lines = [line for line in scenes.read_text().splitlines() if line.strip()]
+    except (OSError, UnicodeDecodeError) as error:
+        raise fault(scenes, f"the list cannot be read ({error})", "write the name of a segment a line") from error
+    if not 0 <= place < len(lines):
+        message = f"data.log.scene={place} is not within the {len(lines)} segments of {scenes}, counted from 0"
+        raise ValueError(f"{message}; there are files of {shown}")
+    return lines[place]
+
+
+_KINDS = {"sky": (25,), "human": (6, 7, 9, 10, 11), "vehicle": (2, 3, 4, 5, 8)}
+"""Of Waymo's 28 classes: bicycles and motorcycles count as human, as in DriveStudio's masks."""
+
+
+def decode_image(
+    data: bytes, recorded: tuple[int, int], size: tuple[int, int], path: Path, what: str
+) -> UInt8[Tensor, "h w 3"]:
+    """RGB at ``size``; raises LogError for bytes that are no image of ``recorded`` (width, height)."""
+    pixels = _opened(data, recorded, path, what, "RGB")
+    return torch.from_numpy(np.array(pixels if size == recorded else pixels.resize(size, Image.Resampling.BILINEAR)))
+
+
+def decode_masks(
+    data: bytes, divisor: int, recorded: tuple[int, int], size: tuple[int, int], path: Path, what: str
+) -> dict[str, Bool[Tensor, "h w"]]:
+    """Kind -> mask at ``size``, from a PNG of class * divisor + instance. Raises as ``decode_image``.
+
+    Sky takes the nearest pixel; other masks keep every pixel that an object touches, as those of files do.
+    """
+    if divisor <= 0:
+        raise fault(path, f"{what} has the divisor {divisor}", REMEDY)
+    classes = np.array(_opened(data, recorded, path, what, None)).astype(np.int32) // divisor
+    masks = {}
+    for kind, members in _KINDS.items():
+        mask = 255 * np.isin(classes, members, kind="table").astype(np.uint8)
+        if size != recorded:
+            way = Image.Resampling.NEAREST if kind == "sky" else Image.Resampling.BILINEAR
+            mask = np.array(Image.fromarray(mask).resize(size, way))
+        masks[kind] = torch.from_numpy(mask > 0)
+    return masks
+
+
+def _opened(data: bytes, recorded: tuple[int, int], path: Path, what: str, mode: str | None) -> Image.Image:
+    """The size is compared before a pixel is decoded."""
+    try:
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+            if image.size != recorded:
+                found = f"{image.size[0]}x{image.size[1]}"
+                raise fault(path, f"{what} is {found}, its calibration is for {recorded[0]}x{recorded[1]}", REMEDY)
+            if mode is None and image.mode not in ("I;16", "I", "L"):
+                raise fault(path, f"{what} has pixels of the kind {image.mode}, not one number each", REMEDY)
+            return image.copy() if mode is None else colors(image, path)
+    except LogError:
+        raise
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise fault(path, f"{what} cannot be decoded ({error})", REMEDY) from error
+
+
+_ORDERS = {
+    0: "not declared, taken as all pixels at once",
+    1: "rows from the top",
+    2: "columns from the left",
+    3: "rows from below",
+    4: "columns from the right",
+    5: "all pixels at once",
+}
+
+
+def segment_notes(
+    segment: Segment,
+    frames: range,
+    cameras: Sequence[str],
+    shots: Sequence[RecordedImage],
+    num_labelled: int,
+) -> tuple[str, ...]:
+    """One sentence each: the shutter's direction, labels made by hand, and images and sweeps that are missing."""
+    notes = [*segment.notes, *_shutters(segment, cameras)]
+    if num_labelled:
+        notes.append(
+            f"{num_labelled} of {len(shots)} images have masks of sky, people and vehicles, which Waymo had drawn by "
+            "hand; the others have none"
+        )
+    lacking = len(frames) * len(cameras) - len(shots)
+    if lacking:
+        notes.append(
+            f"{lacking} of {len(frames) * len(cameras)} images are not in the files: their cameras are left out"
+        )
+    swept = sum(map(segment.has_returns, frames))
+    if 0 < swept < len(frames):
+        notes.append(f"{len(frames) - swept} of {len(frames)} frames have no range images: they have no points")
+    return tuple(notes)
+
+
+def _shutters(segment: Segment, cameras: Sequence[str]) -> list[str]:
+    found: dict[int, list[str]] = {}
+    for name in cameras:
+        found.setdefault(segment.cameras[name].direction, []).append(name)
+    return [f"cameras {', '.join(names)} are read out so: {_ORDERS[direction]}" for direction, names in found.items()]
+
 
 _USUAL = ("FRONT", "FRONT_LEFT", "FRONT_RIGHT")
 _HALF = SPIN // 2
@@ -41,7 +218,7 @@ class WaymoReader(RecordedReader):
     the frame is of. Each image has the pose and the stamp of the middle of its readout.
     """
 
-    marks = Marks(("*.tfrecord", "vehicle_pose/*.parquet", "camera_image/*.parquet"), depth=2)
+    marks = FolderSignature(("*.tfrecord", "vehicle_pose/*.parquet", "camera_image/*.parquet"), depth=2)
 
     scene: str | int | None = None
     """Name of a segment, or its place in ``scenes``, from 0; None: the only one."""

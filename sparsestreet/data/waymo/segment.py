@@ -3,19 +3,25 @@
 The vehicle's axes, and a camera's, are x forward, y left, z up. The world is Waymo's global one: east, north, up.
 """
 
+import os
+import tempfile
+import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
-from sparsestreet.data.fingerprint import LogFiles
+from sparsestreet.data.frame_cache import Lock
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import Problem, fault
+from sparsestreet.data.reader import LogFiles
 
 CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
 LIDARS = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}
@@ -261,3 +267,128 @@ def box_label(
             message = f"box {name} of {what} has the center, size and heading {[round(float(v), 3) for v in one]}"
             raise fault(path, f"{message}: no box can be so", REMEDY)
     return BoxLabel(name, kind, tuple(box), None if seen_box is None else tuple(seen_box), seen_by)
+
+
+FARTHEST = 1000.0
+"""Meters: no return is from there."""
+SPIN = 100_000_000
+"""Nanoseconds of a turn of the lidar TOP."""
+
+
+def returns_of(
+    lidar: str, images: list[Float[np.ndarray, "_ _ c"]], poses: Float[np.ndarray, "_ _ 6"] | None
+) -> Returns:
+    """What came back, of the range images of the first and the second return; range is their first channel."""
+    pixels, ranges = [], []
+    for image in images:
+        values = image[..., 0].ravel()
+        some = np.flatnonzero(values > 0)
+        pixels.append(some)
+        ranges.append(values[some])
+    height, width = images[0].shape[:2]
+    return Returns(lidar, (height, width), np.concatenate(pixels), np.concatenate(ranges), poses)
+
+
+def check_returns(returns: Returns, lidar: LidarCalibration | None, path: Path, frame: int) -> LidarCalibration:
+    """The calibration. Raises LogError, naming the file, for returns that it or the poses of the pixels do not fit."""
+    what = f"lidar {returns.lidar}"
+    if lidar is None:
+        raise fault(path, f"{what} has range images, but no calibration", REMEDY)
+    if len(lidar.inclinations) not in (0, returns.shape[0]):
+        message = f"{what} has range images of {returns.shape} pixels, but {len(lidar.inclinations)} inclinations"
+        raise fault(path, message, REMEDY)
+    what = f"{what} at frame {frame}"
+    if returns.poses is not None and returns.poses.shape[:2] != returns.shape:
+        message = f"{what} has a range image of {returns.shape} pixels, and poses of {returns.poses.shape[:2]}"
+        raise fault(path, message, REMEDY)
+    broken = int((~(returns.ranges < FARTHEST)).sum())
+    if broken or not (returns.poses is None or np.isfinite(returns.poses).all()):
+        message = f"{what} has {broken} ranges that are NaN, infinite or more than {FARTHEST:g} m, or such poses"
+        raise fault(path, message, REMEDY)
+    return lidar
+
+
+def world_points(
+    returns: Returns, lidar: LidarCalibration, world_from_vehicle: Float64[Tensor, "4 4"]
+) -> Float64[np.ndarray, "n 3"]:
+    """Where the rays ended, in the world.
+
+    Returns of TOP lie where they were measured, each by the pose of its pixel; those without a pose (all zeros) are
+    left out. The files have the points of the other lidars at the pose of the frame, ``world_from_vehicle``.
+    """
+    mount = lidar.vehicle_from_lidar.numpy()
+    rays = _rays(lidar.inclinations, lidar.limits, float(np.arctan2(mount[1, 0], mount[0, 0])), returns.shape)
+    in_sensor = returns.ranges.astype(np.float64)[:, None] * rays[returns.pixels]
+    in_vehicle = in_sensor @ mount[:3, :3].T + mount[:3, 3]
+    if returns.poses is None:
+        pose = world_from_vehicle.numpy()
+        return in_vehicle @ pose[:3, :3].T + pose[:3, 3]
+    poses = returns.poses.reshape(-1, 6)[returns.pixels].astype(np.float64)
+    posed = poses.any(1)
+    return _turned(poses[posed, :3], in_vehicle[posed]) + poses[posed, 3:]
+
+
+def crossing(x: float, y: float) -> int:
+    """Nanoseconds after the start of the spin at which the lidar looks at a place of the vehicle's frame."""
+    return round((np.pi - np.arctan2(y, x)) / (2 * np.pi) * SPIN)
+
+
+@lru_cache(maxsize=8)
+def _rays(
+    inclinations: tuple[float, ...], limits: tuple[float, float], yaw: float, shape: tuple[int, int]
+) -> Float64[np.ndarray, "n 3"]:
+    """Unit vectors of all pixels in the sensor's frame, which is turned by ``yaw`` against the vehicle's."""
+    height, width = shape
+    low, high = limits
+    rows = np.array(inclinations) if inclinations else (np.arange(height) + 0.5) / height * (high - low) + low
+    inclination = rows[::-1, None]
+    azimuth = ((width - np.arange(width) - 0.5) / width * 2 - 1) * np.pi - yaw
+    flat = np.cos(inclination)
+    rays = (flat * np.cos(azimuth), flat * np.sin(azimuth), np.broadcast_to(np.sin(inclination), shape))
+    return np.stack(rays, -1).reshape(-1, 3)
+
+
+def _turned(angles: Float64[np.ndarray, "n 3"], points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
+    """Rz(yaw) Ry(pitch) Rx(roll) of each point, for angles roll, pitch, yaw."""
+    (x, y, z), (roll, pitch, yaw) = points.T, angles.T
+    y, z = np.cos(roll) * y - np.sin(roll) * z, np.sin(roll) * y + np.cos(roll) * z
+    x, z = np.cos(pitch) * x + np.sin(pitch) * z, np.cos(pitch) * z - np.sin(pitch) * x
+    return np.stack((np.cos(yaw) * x - np.sin(yaw) * y, np.sin(yaw) * x + np.cos(yaw) * y, z), -1)
+
+
+class Spool:
+    """Bytes by key. They go to the folder for temporary files (TMPDIR), not to memory."""
+
+    def __init__(self) -> None:
+        self._file: BinaryIO | None = None
+        self._places: dict[Hashable, tuple[int, int]] = {}
+        self._end = 0
+        self._lock = Lock()
+
+    def __contains__(self, key: Hashable) -> bool:
+        return key in self._places
+
+    def put(self, key: Hashable, data: bytes) -> None:
+        """Raises LogError where the folder has no room."""
+        try:
+            with self._lock:
+                file = self._opened()
+                start, self._end = self._end, self._end + len(data)
+            done = 0
+            while done < len(data):
+                done += os.pwrite(file.fileno(), data[done:], start + done)
+        except OSError as error:
+            folder, remedy = Path(tempfile.gettempdir()), "make room, or set TMPDIR to a folder with room"
+            raise fault(folder, f"{len(data)} bytes of decoded data cannot be kept here ({error})", remedy) from error
+        self._places[key] = start, len(data)
+
+    def get(self, key: Hashable) -> bytes:
+        start, length = self._places[key]
+        return os.pread(self._opened().fileno(), length, start)
+
+    def _opened(self) -> BinaryIO:
+        if self._file is None:
+            # Open as long as this object lives.
+            self._file = tempfile.TemporaryFile(prefix="sparsestreet-")  # noqa: SIM115
+            weakref.finalize(self, self._file.close)
+        return self._file

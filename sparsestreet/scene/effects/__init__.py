@@ -15,9 +15,7 @@ from sparsestreet.scene.effects.hood import HoodSettings
 from sparsestreet.scene.effects.lens import Lens, LensSettings
 from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
 from sparsestreet.scene.effects.motion_blur import MotionBlur, MotionBlurSettings
-from sparsestreet.scene.effects.night import NightSettings
 from sparsestreet.scene.effects.plan import EffectPlan, plan_effects
-from sparsestreet.scene.effects.saturation import SaturationSettings
 from sparsestreet.scene.effects.shutter import RollingShutter, ShutterSettings
 from sparsestreet.scene.effects.sky import Sky, SkySettings
 
@@ -43,9 +41,7 @@ __all__ = [
     "Moment",
     "MotionBlur",
     "MotionBlurSettings",
-    "NightSettings",
     "RollingShutter",
-    "SaturationSettings",
     "ShutterSettings",
     "Sky",
     "SkySettings",

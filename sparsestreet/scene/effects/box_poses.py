@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sparsestreet.evidence.boxes import box_jitter
+from sparsestreet.evidence.motion import box_jitter
 from sparsestreet.geometry.boxes import displacement
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData

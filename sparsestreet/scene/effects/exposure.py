@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestreet.evidence.exposure import ImageGains, image_gains
-from sparsestreet.evidence.gain_errors import EV, FEWEST_INSTANTS, GainErrors, gain_errors
+from sparsestreet.evidence.exposure import EV, FEWEST_INSTANTS, GainErrors, ImageGains, gain_errors, image_gains
 from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.pictures.images import Dots
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
@@ -28,7 +27,7 @@ from sparsestreet.types import Rendering, View
 class ExposureSettings(EffectSettings):
     """Called for where gains for images would remove an error of ``threshold`` or more from held-out images.
 
-    The error is measured at static lidar points (``evidence/gain_errors.py``). A gain that jumps at random from image
+    The error is measured at static lidar points (``evidence/exposure.py``). A gain that jumps at random from image
     to image is not called for: neighbors do not foretell it. Raises ValueError for a threshold or a weight below 0.
     """
 

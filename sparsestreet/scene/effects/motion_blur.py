@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from sparsestreet.evidence.blur import blur_length, exposure_motions
+from sparsestreet.evidence.motion import blur_length, exposure_motions
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Exposed, Finding, Moment

@@ -10,12 +10,10 @@ from torch import Tensor
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 
-NOT_SIMULATED = "nothing simulates it"
-
 
 @dataclass(frozen=True, kw_only=True)
 class ReportedSettings(EffectSettings):
-    """``detect`` says that ``NOT_SIMULATED`` is missing: the plan reports what is called for, and leaves it off."""
+    """The plan reports what is called for, and nothing is built for it."""
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> None:
         return None

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sparsestreet.evidence.shear import readout_shear, shear_over
+from sparsestreet.evidence.motion import readout_shear, shear_over
 from sparsestreet.pictures.images import Places
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData

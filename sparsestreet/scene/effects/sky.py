@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestreet.evidence.sky import sky_share
+from sparsestreet.evidence.light import sky_share
 from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import over_sky
 from sparsestreet.ops.cube_map import colors_along

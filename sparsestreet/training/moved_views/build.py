@@ -4,7 +4,7 @@ import logging
 from collections.abc import Mapping
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.registration import EdgeShift, edge_shift
+from sparsestreet.data.lidar import EdgeShift, edge_shift
 from sparsestreet.geometry.boxes import displacement, without_frames
 from sparsestreet.phases import stage
 from sparsestreet.scene.assignment import assign_tracks

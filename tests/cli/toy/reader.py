@@ -5,13 +5,12 @@ from pathlib import Path
 
 import torch
 
-from sparsestreet.data.clock import LogClock
 from sparsestreet.data.images import check_pixels, image_size, read_image
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.data.marks import Marks
 from sparsestreet.data.problems import LogError, Problem, attempt
-from sparsestreet.data.reader import LogReader
+from sparsestreet.data.reader import FolderSignature, LogReader
+from sparsestreet.data.timestamps import LogClock
 from sparsestreet.types import Camera, Frame, View
 
 
@@ -19,7 +18,7 @@ from sparsestreet.types import Camera, Frame, View
 class PicturesReader(LogReader):
     """000.png, 001.png ...: one camera that drives ahead, a meter a picture."""
 
-    marks = Marks(("000.png",))
+    marks = FolderSignature(("000.png",))
 
     root: Path | str
     focal: float

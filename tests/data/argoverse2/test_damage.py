@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sparsestreet.data.argoverse2 import Argoverse2Reader, feather
-from sparsestreet.data.argoverse2.feather import read_columns
+from sparsestreet.data.argoverse2 import Argoverse2Reader, reader
+from sparsestreet.data.argoverse2.reader import read_columns
 from sparsestreet.data.problems import LogError
 from tests.data.damage import daily
 from tests.data.plan import Plan
@@ -204,7 +204,7 @@ def test_a_damage_is_one_error_that_names_the_file(name, log):
 
 
 def test_a_file_larger_than_any_of_the_data_set_is_refused(log, monkeypatch):
-    monkeypatch.setattr(feather, "MAX_BYTES", (log / SWEEP).stat().st_size - 1)
+    monkeypatch.setattr(reader, "MAX_BYTES", (log / SWEEP).stat().st_size - 1)
     with pytest.raises(LogError, match=r"that are read"):
         read_columns(log / SWEEP, dict.fromkeys("xyz", float))
 

@@ -8,15 +8,24 @@ import pytest
 import torch
 
 from sparsestreet.data.argoverse2 import Argoverse2Reader
-from sparsestreet.data.argoverse2.layout import Layout, find_log, stamped_files
-from sparsestreet.data.argoverse2.tables import read_boxes, read_cameras, read_path, read_sweep
+from sparsestreet.data.argoverse2.reader import (
+    Layout,
+    find_log,
+    read_boxes,
+    read_cameras,
+    read_path,
+    read_sweep,
+    stamped_files,
+)
 from sparsestreet.data.problems import LogError
+from sparsestreet.geometry.cameras import inverse, project
+from tests.data.argoverse2.write import CAMERAS, LOG, read_table, write_log
+from tests.typed import there
 
 pytest.importorskip("pyarrow", reason="feather files need pyarrow")
 
-from tests.data.argoverse2.write import read_table
 
-LOG = "7fab2350"
+GENUINE = "7fab2350"
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +39,7 @@ def genuine() -> Path:
 
 @pytest.fixture(scope="module")
 def layout(genuine) -> Layout:
-    return find_log(genuine, LOG)
+    return find_log(genuine, GENUINE)
 
 
 def test_each_sweep_has_a_pose_of_exactly_its_stamp(layout):
@@ -84,7 +93,48 @@ def test_its_cameras_are_pinholes_and_one_stands_upright(layout):
 
 
 def test_a_log_whose_images_were_not_fetched_is_refused_in_words(genuine):
-    (problem,) = Argoverse2Reader(root=genuine, scene=LOG).check()
+    (problem,) = Argoverse2Reader(root=genuine, scene=GENUINE).check()
     assert problem.message == "there are no images"
     with pytest.raises(LogError, match="fetch those of the cameras that you want"):
-        Argoverse2Reader(root=genuine, scene=LOG).read()
+        Argoverse2Reader(root=genuine, scene=GENUINE).read()
+
+
+pytest.importorskip("pyarrow", reason="feather files need pyarrow")
+loading = pytest.importorskip("av2.datasets.sensor.av2_sensor_dataloader", reason="av2 is not installed")
+structures = pytest.importorskip("av2.structures.sweep", reason="av2 is not installed")
+
+
+def test_their_poses_cameras_points_and_boxes_are_ours(tmp_path):
+    log = write_log(tmp_path / "first")
+    ours = Argoverse2Reader(root=log, cameras=list(CAMERAS)).recording()
+    theirs = loading.AV2SensorDataLoader(data_dir=log.parent, labels_dir=log.parent)
+    stamps = theirs.get_ordered_log_lidar_timestamps(LOG)
+    assert there(ours.frame_stamps) == tuple(stamps)
+    for frame, stamp in enumerate(stamps):
+        city_from_ego = theirs.get_city_SE3_ego(LOG, stamp)
+        sweep = structures.Sweep.from_feather(Path(theirs.get_lidar_fpath(LOG, stamp)))
+        points = city_from_ego.transform_point_cloud(sweep.xyz.astype(np.float64))
+        np.testing.assert_allclose(there(ours.sweeps)[frame].read().numpy(), points, atol=1e-6)
+        boxes = {one.category: one for one in theirs.get_labels_at_lidar_timestamp(LOG, stamp).cuboids}
+        for box in there(ours.boxes):
+            if frame in box.frames.tolist():
+                row, cuboid = box.frames.tolist().index(frame), boxes[box.class_name]
+                pose = city_from_ego.compose(cuboid.dst_SE3_object).transform_matrix
+                np.testing.assert_allclose(box.poses[row], pose, atol=1e-6)
+                assert box.sizes[row].tolist() == [cuboid.length_m, cuboid.width_m, cuboid.height_m]
+    for camera in ours.rig:
+        pinhole = theirs.get_log_pinhole_camera(LOG, camera.name)
+        (shot,) = (one for one in ours.shots if (one.frame, one.camera) == (1, camera.index))
+        assert Path(str(shot.key)) in theirs.get_ordered_log_cam_fpaths(LOG, camera.name)
+        # Points of the sweep in the image: their pixels have centers at whole numbers, ours at +0.5.
+        ego_from_city = np.linalg.inv(
+            shot.world_from_camera.numpy() @ np.linalg.inv(pinhole.ego_SE3_cam.transform_matrix)
+        )
+        city = there(ours.sweeps)[1].read()
+        ego = city.numpy() @ ego_from_city[:3, :3].T + ego_from_city[:3, 3]
+        pixels, _, seen = pinhole.project_ego_to_img(ego)
+        local = city @ inverse(shot.world_from_camera)[:3, :3].T + inverse(shot.world_from_camera)[:3, 3]
+        mine, _, inside = project(camera.at(torch.eye(4, dtype=torch.float64)), local.float())
+        assert inside.sum() > 10
+        both = inside.numpy() & seen
+        np.testing.assert_allclose(mine.numpy()[both], pixels[both][:, :2] + 0.5, atol=1e-3)  # float32 of ours

@@ -2,13 +2,24 @@
 
 import json
 import shutil
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import ImageFile
 
-from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.drivestudio import DriveStudioReader, contents
+from sparsestreet.data.log import split
 from sparsestreet.geometry.cameras import project
+from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.rendering import RenderOptions, render
+from sparsestreet.types import Frame, Sweep
 from tests.data.drivestudio.folders import (
     CAR,
     CAR_SIZE,
@@ -27,6 +38,7 @@ from tests.data.drivestudio.folders import (
     write_lines,
     write_stamps,
 )
+from tests.scene.street import background
 from tests.typed import there
 
 MAP = np.array([450123.377, 5400321.713, 230.19])  # meters, as UTM coordinates of central Europe
@@ -354,3 +366,187 @@ def test_own_stamps_need_own_poses_and_a_clock(tmp_path):
         (problem,) = DriveStudioReader(tmp_path / name).check()
         assert problem.path == tmp_path / name / "timestamps_0.txt"
         assert said in problem.message
+
+
+FLAVOURS = pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
+
+
+@pytest.fixture
+def decoded(monkeypatch) -> Counter[str]:
+    """How often each image was decoded."""
+    counts: Counter[str] = Counter()
+
+    def count(path: Path, *arguments):
+        counts[path.stem] += 1
+        return read_image(path, *arguments)
+
+    read_image = contents.read_image
+    monkeypatch.setattr(contents, "read_image", count)
+    return counts
+
+
+def same_frame(frame: Frame, other: Frame) -> bool:
+    parts = [(frame.image, other.image), (frame.sky, other.sky), (frame.human, other.human)]
+    parts += [(frame.vehicle, other.vehicle), (frame.depth, other.depth)]
+    return all(torch.equal(*part) for part in parts)
+
+
+def same_sweep(sweep: Sweep, other: Sweep) -> bool:
+    parts = [(sweep.points, other.points), (sweep.colors, other.colors), (sweep.colored, other.colored)]
+    return all(torch.equal(*part) for part in parts)
+
+
+@FLAVOURS
+def test_opening_splitting_and_measuring_a_log_decodes_no_image(make, tmp_path, monkeypatch):
+    def load(image: ImageFile.ImageFile) -> None:
+        raise AssertionError(f"{image.filename} was decoded")
+
+    monkeypatch.setattr(ImageFile.ImageFile, "load", load)
+    log = DriveStudioReader(make(tmp_path, frames=6)).read()
+    parts = split(log, stride=3, offset=1)
+    assert log.radius > 0
+    assert (len(log.views), len(parts.train), parts.held_out_indices) == (12, 8, {1, 4})
+    assert len(log.frames[2:5]) == 3
+    with pytest.raises(AssertionError, match=r"000_0\.(jpg|png) was decoded"):
+        log.frames[0]
+
+
+def test_each_image_is_decoded_once_while_there_is_room(tmp_path, decoded):
+    log = DriveStudioReader(make_nuscenes(tmp_path)).read()
+    first = list(log.frames)
+    for frame, again in zip(first, log.frames, strict=True):
+        assert same_frame(frame, again)
+    assert len(list(log.sweeps)) == 3
+    assert set(decoded.values()) == {1}
+    assert len(decoded) == 6
+
+
+def test_sweeps_leave_the_images_that_color_them_for_the_frames(tmp_path, decoded):
+    log = DriveStudioReader(make_nuscenes(tmp_path)).read()
+    assert log.sweeps[1].colored.any()
+    assert set(decoded) == {"001_0", "001_1"}
+    assert log.frames[2].frame_index == 1
+    assert set(decoded.values()) == {1}
+
+
+@FLAVOURS
+def test_without_room_everything_is_read_anew_and_the_same(make, tmp_path, decoded):
+    log, forgetful = DriveStudioReader(make(tmp_path)).read(), DriveStudioReader(tmp_path, cache_mb=0).read()
+    for index in (5, 0, 3, 0):
+        assert same_frame(forgetful.frames[index], log.frames[index])
+        assert forgetful.frames[index] is not forgetful.frames[index]
+    for index in (2, 0, 2):
+        assert same_sweep(forgetful.sweeps[index], log.sweeps[index])
+    # Once for log; for the other three times at each visit of frame 0, and once for the sweep.
+    assert decoded["000_0"] == 1 + 2 * 3 + 1
+
+
+@FLAVOURS
+def test_a_gray_sweep_is_the_sweep_without_its_colors(make, tmp_path):
+    """The vehicle passes the points that stand around, so that the cameras of an instant see others than the first."""
+    log = DriveStudioReader(make(tmp_path, frames=10)).read()
+    for gray, sweep in zip(log.sweeps.gray(), log.sweeps, strict=True):
+        assert (gray.index, gray.points.tolist()) == (sweep.index, sweep.points.tolist())
+        assert torch.equal(gray.colored, sweep.colored)
+    assert len({int(gray.colored.sum()) for gray in log.sweeps.gray()}) > 1
+
+
+MEASURE = """
+import re, sys
+import torch
+from sparsestreet.data.drivestudio import DriveStudioReader
+from sparsestreet.data.log import split
+
+def resident(name):
+    return int(re.search(name + r":\\s+(\\d+) kB", open("/proc/self/status").read())[1]) * 1024
+
+torch.set_num_threads(1)
+before = resident("VmRSS")
+log = DriveStudioReader(sys.argv[1], cache_mb=16).read()
+parts = split(log)
+assert log.radius > 0
+opened = resident("VmHWM") - before
+assert sum(int(frame.sky.sum()) for frame in parts.train) > 0
+assert sum(len(sweep.points) for sweep in log.sweeps) > 0
+print(opened, resident("VmHWM") - before)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads the peak of memory from Linux' /proc")
+def test_a_log_takes_no_more_memory_than_its_cache_and_its_points(tmp_path):
+    make_nuscenes(tmp_path, frames=60)
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    for suffix, content in ((".jpg", pixels), (".png", 255 * (pixels[..., 0] > 127).astype(np.uint8))):
+        write_image(tmp_path / f"large{suffix}", content)
+        for image in tmp_path.rglob(f"*_[01]{suffix}"):
+            shutil.copy(tmp_path / f"large{suffix}", image)
+    measured = subprocess.run([sys.executable, "-c", MEASURE, tmp_path], capture_output=True, text=True, check=True)
+    opened, used = map(int, measured.stdout.split())
+    # All 120 frames of 480x320 take 184 MB decoded. Opening decodes none; 16 MB are cached then, and what a frame
+    # in the making and the first calls into Pillow and torch take is added to both.
+    assert opened < 30e6
+    assert 16e6 < used < 70e6
+
+
+BARREL = [-0.3, 0.05, 0.002, -0.001, 0.01]
+"""Moves pixels of a 40x24 image by up to 3.38, of one half as large by half of that."""
+SLIGHT = [0.05, 0.0, 0.0, 0.0, 0.0]
+"""By up to 0.378."""
+
+
+def with_lenses(root):
+    """A log whose first camera is a pinhole."""
+    make_waymo(root, cameras=3)
+    for camera, lens in ((1, BARREL), (2, SLIGHT)):
+        write_lines(root / f"intrinsics/{camera}.txt", [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, *lens])
+    return root
+
+
+@pytest.mark.parametrize(("width", "shifts"), [(None, ("3.38", "0.378")), (20, ("1.69", "0.189"))])
+def test_cameras_have_their_lenses_and_notes_say_how_far_they_move_pixels(width, shifts, tmp_path):
+    """However little that is: a plan decides what is simulated."""
+    log = DriveStudioReader(with_lenses(tmp_path), width=width).read()
+    pinhole, *cameras = (view.camera for view in log.frames.views[-3:])
+    assert pinhole.distortion is None
+    for camera, lens in zip(cameras, (BARREL, SLIGHT), strict=True):
+        assert torch.equal(there(camera.distortion), torch.tensor(lens))
+    first, second = shifts
+    assert log.notes[0] == f"camera 1: its lens moves pixels by up to {first}"
+    assert log.notes[1] == f"camera 2: its lens moves pixels by up to {second}"
+    assert len(log.notes) == 2
+
+
+def test_lidar_meets_the_pixels_behind_the_lens(tmp_path):
+    """(10, 2, 0.75) is 1.5 m to the left of camera 1 and 0.75 m below: 6 and 3 pixels from the center without a lens.
+    r^2 = 0.028, and a barrel of -8 makes that 0.775 of it: 4.65 and 2.3."""
+    lines = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, -8.0, 0, 0, 0, 0]
+    write_lines(make_nuscenes(tmp_path) / "intrinsics/1.txt", lines)
+    log = DriveStudioReader(tmp_path).read()
+    depth = log.frames[1].depth
+    assert depth[14, 15] == pytest.approx(10.0, abs=1e-5)
+    assert depth[15, 14] == 0
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_a_scene_is_drawn_where_the_camera_of_a_log_sees_it(backend, tmp_path):
+    """A Gaussian of 2 cm at 6 m, far off the center: the middle of what it covers is where the point projects."""
+    view = DriveStudioReader(with_lenses(tmp_path)).read().frames.views[1]
+    x, y, z = view.camera.position.tolist()
+    point = torch.tensor([[x + 2.4, y + 6.0, z - 1.4]])  # Waymo's vehicle drives along y here
+    columns = {
+        "means": point,
+        "log_scales": torch.full((1, 3), 0.02).log(),
+        "quaternions": torch.tensor([[1.0, 0, 0, 0]]),
+        "opacity_logits": torch.zeros(1),
+        "sh_dc": torch.zeros(1, 1, 3),
+        "sh_rest": torch.zeros(1, 0, 3),
+    }
+    alpha = render(SceneGraph({"a": background(Rows(columns))}), view, options=RenderOptions(backend=backend)).alpha
+    row, column = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    middle = torch.stack(((column * alpha).sum(), (row * alpha).sum())) / alpha.sum()
+    expected, _, inside = project(view.camera, point)
+    assert inside.all()
+    # Its pixels end where they fade into 1/255, not evenly around the middle.
+    assert (middle - expected[0]).norm() < 0.1
+    assert (middle - project(replace(view.camera, distortion=None), point)[0][0]).norm() > 1

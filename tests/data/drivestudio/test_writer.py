@@ -14,7 +14,7 @@ from PIL import Image
 from sparsestreet.cli.config.compose import CONF
 from sparsestreet.data.convert import Source, convert
 from sparsestreet.data.drivestudio import DriveStudioReader, DriveStudioWriter
-from sparsestreet.data.drivestudio.classes import KNOWN, class_in
+from sparsestreet.data.drivestudio.annotations import KNOWN, class_in
 from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nuscenes import NuScenesReader
@@ -31,9 +31,15 @@ from tests.data.drivestudio.folders import (
 )
 from tests.data.drivestudio.test_bodies import person, write_people
 from tests.data.nuscenes.written import write_nuscenes
-from tests.data.plan import Plan
-from tests.data.same_log import check_same_masks, check_same_sweeps, check_same_track, check_same_views, in_data_set
-from tests.data.streets import make_log
+from tests.data.plan import (
+    Plan,
+    check_same_masks,
+    check_same_sweeps,
+    check_same_track,
+    check_same_views,
+    in_data_set,
+    make_log,
+)
 
 LOSSLESS = DriveStudioWriter(jpeg_quality=None)
 MAP = np.array([5.4e6, -3.2e5, 40.0])

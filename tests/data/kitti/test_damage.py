@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from sparsestreet.data.kitti import KittiReader
-from sparsestreet.data.kitti.tracklets import read_tracklets
-from sparsestreet.data.kitti.velodyne import read_points
+from sparsestreet.data.kitti.files import read_points
+from sparsestreet.data.kitti.reader import read_tracklets
 from sparsestreet.data.problems import LogError
 from tests.data.damage import (
     LAUGHS,

@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from sparsestreet.data.kitti import KittiReader
-from sparsestreet.data.kitti.velodyne import point_stamps
+from sparsestreet.data.kitti.files import point_stamps, read_stamps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import Recording
 from sparsestreet.geometry.cameras import inverse, transform_points
@@ -180,3 +180,19 @@ def test_the_baseline_of_its_cameras_is_exact(recording):
     left, right = (shot.world_from_camera for shot in recording.shots[:2])
     between = transform_points(inverse(left), right[None, :3, 3])[0].numpy()
     assert between == pytest.approx([0.0599 + 0.4731, -0.0004 - 0.0028, 0.0], abs=POSITION)
+
+
+@pytest.mark.parametrize(
+    ("text", "stamp"),
+    [
+        # GNU date: date -u -d "2011-09-26 13:04:32" +%s
+        ("2011-09-26 13:04:32.345323776", 1_317_042_272_345_323_776),
+        ("2011-09-26 13:04:32.3453", 1_317_042_272_345_300_000),
+        ("2011-09-26 13:04:32", 1_317_042_272_000_000_000),
+        ("2012-02-29 23:59:59.000000001", 1_330_559_999_000_000_001),
+    ],
+)
+def test_a_line_is_the_stamp_of_its_frame(tmp_path, text, stamp):
+    path = tmp_path / "timestamps.txt"
+    path.write_text(f"{text}\n\n{text}\r\n")
+    assert read_stamps(path) == [stamp, None, stamp]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sparsestreet.data.kitti360 import Kitti360Reader
-from sparsestreet.data.kitti360.boxes import read_boxes
+from sparsestreet.data.kitti360.files import read_boxes
 from sparsestreet.data.problems import LogError
 from tests.data.damage import (
     LAUGHS,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sparsestreet.data.kitti360 import Kitti360Reader
-from sparsestreet.data.kitti360.boxes import read_boxes
+from sparsestreet.data.kitti360.files import read_boxes
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import Recording
 from tests.data.kitti360.write import (

@@ -12,7 +12,7 @@ from PIL import Image
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.nerfstudio import NerfstudioReader
 from sparsestreet.data.problems import LogError, check_missing
-from sparsestreet.data.undistortion import Undistortion
+from sparsestreet.data.rig import Undistortion
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye
 from tests.data.nerfstudio.write import UNIT, points_of, write_json, write_nerfstudio

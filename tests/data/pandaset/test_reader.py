@@ -10,7 +10,7 @@ import torch
 import yaml
 
 from sparsestreet.data.pandaset import PandaSetReader
-from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR
+from sparsestreet.data.pandaset.tables import CAMERA_FROM_LIDAR
 from tests.data.pandaset.pickles import table, write
 from tests.data.pandaset.write import CAMERAS, PARKED, TWIN, UUID, PandaPlan, cuboids, sweep, write_sequence
 from tests.typed import there

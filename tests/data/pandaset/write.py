@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from sparsestreet.data.pandaset.layout import CAMERA_FROM_LIDAR
+from sparsestreet.data.pandaset.tables import CAMERA_FROM_LIDAR
 from sparsestreet.geometry import quaternions as quat
 from tests.data.pandaset.pickles import Era, table, write
 from tests.data.plan import PER_SECOND, Plan, PlannedCamera, pose, turned

@@ -10,7 +10,7 @@ import pytest
 
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.rig_json import RigJsonReader
-from sparsestreet.data.rig_json.sweeps import read_rows
+from sparsestreet.data.rig_json.reader import read_rows
 from tests.data.plan import Plan
 from tests.data.rig_json.write import write_json
 

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from sparsestreet.data.synthetic.coverage import beyond, strip, stripes
-from sparsestreet.data.synthetic.noise import cell_random, smooth_noise, stream
-from sparsestreet.data.synthetic.parts import Part
 from sparsestreet.data.synthetic.settings import StreetSettings
-from sparsestreet.data.synthetic.textures.plain import Grainy
+from sparsestreet.data.synthetic.textures import Grainy, beyond, cell_random, smooth_noise, stream, strip, stripes
+from sparsestreet.data.synthetic.tracer import Part
 from sparsestreet.data.synthetic.world import build_world
 
 

@@ -4,7 +4,7 @@ import logging
 
 import pytest
 
-from sparsestreet.data.registration import EdgeShift
+from sparsestreet.data.lidar import EdgeShift
 from sparsestreet.training.moved_views.build import report_shift
 
 

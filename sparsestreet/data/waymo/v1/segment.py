@@ -7,9 +7,9 @@ from pathlib import Path
 from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.fingerprint import LogFiles
 from sparsestreet.data.problems import Problem, fault
-from sparsestreet.data.waymo import lidar
+from sparsestreet.data.reader import LogFiles
+from sparsestreet.data.waymo import segment
 from sparsestreet.data.waymo.segment import (
     CAMERAS,
     LIDARS,
@@ -86,7 +86,7 @@ class RecordSegment(Segment):
             poses = fields.range_image(first, 4, 6) if name == "TOP" else None
             images = [image for image in images if image is not None]
             if images:
-                found.append(lidar.returns_of(name, images, poses))
+                found.append(segment.returns_of(name, images, poses))
         return found
 
     def files(self) -> LogFiles:

@@ -1,1 +1,0 @@
-"""Things that stand, drive and walk in the street, built from parts."""

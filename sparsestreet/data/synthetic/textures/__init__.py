@@ -1,1 +1,0 @@
-"""Procedural textures, filtered over the pixel's footprint."""
