@@ -28,9 +28,7 @@ STEPS = {
         *torch.zeros(4, 2, 3), torch.zeros(2).long(), AdamStep(1, 0.1), width=3, backend=backend
     ),
     "activate": lambda backend: activate([ROWS], sh_degree=0, backend=backend),
-    "poses": lambda backend: poses_at(
-        TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend
-    ),
+    "poses": lambda backend: poses_at(TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend),
     "sky": lambda backend: over_sky(
         IMAGE, IMAGE[..., 0], torch.zeros(6, 1, 1, 3), CAMERA, transmittance_min=0.1, backend=backend
     ),
