@@ -1,4 +1,4 @@
-"""SSIM and its gradient in C++ and Triton against torch in float64, finite differences, and which backend takes what."""
+"""SSIM and its gradient in C++ and Triton against torch in float64 and finite differences."""
 
 import pytest
 import torch
