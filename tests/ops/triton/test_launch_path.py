@@ -12,7 +12,6 @@ from triton.runtime.jit import KernelInterface
 from sparsestreet.ops.triton import launch
 from tests.ops.triton.recording import run_compiler
 
-
 FORWARD = [
     "project_rows", "list_visible", "list_pairs", "bound_tiles", "order_tiles", "blend_tiles",
     "blend_tiles", "compose_pixels",
