@@ -164,12 +164,13 @@ def adam_rows_(
     if chosen == "torch" or not all(one.is_contiguous() for one in (parameter, exp_avg, exp_avg_sq)):
         _in_torch(parameter, gradient, exp_avg, exp_avg_sq, refused, step, width)
         return
-    if chosen == "cpu":
-        pass
-    else:
-        pass
-    step_rows_in_library_(
-        parameter, gradient.contiguous(), exp_avg, exp_avg_sq, refused,
+    moments, step_rows_ = (exp_avg, exp_avg_sq), step_rows_in_library_
+    if chosen == "triton":
+        from sparsestreet.ops.triton.adam import step_finite_rows_
+
+        step_rows_ = step_finite_rows_
+    step_rows_(
+        parameter, gradient.contiguous(), *moments, refused,
         width=width, size=step.size, root=step.root, betas=step.betas, eps=step.eps,
     )  # fmt: skip
 

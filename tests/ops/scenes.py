@@ -36,13 +36,15 @@ def _dtypes(backend: str) -> tuple[torch.dtype, ...]:
 
 
 def _each(backends: tuple[str, ...], *, in_every_precision: bool) -> pytest.MarkDecorator:
+    """Float64 waits for ``make test-all`` where float32, in which training runs, is tested as well."""
     cases = []
     for backend in backends:
         marks = [pytest.mark.interpreted] * (backend == "triton" and device_of(backend) == CPU)
         if in_every_precision:
             for dtype in _dtypes(backend):
                 name = f"{backend}-{str(dtype).removeprefix('torch.')}"
-                cases.append(pytest.param(backend, dtype, marks=marks, id=name))
+                other = [pytest.mark.slow] * (dtype == torch.float64)
+                cases.append(pytest.param(backend, dtype, marks=[*marks, *other], id=name))
         else:
             cases.append(pytest.param(backend, marks=marks))
     return pytest.mark.parametrize(("backend", "dtype") if in_every_precision else "backend", cases)

@@ -31,7 +31,7 @@ def street(raw: RawGaussians, texels: Tensor, view: Camera) -> tuple[Tensor, Ten
     return image, contribution(gaussians, view).weight + 1, leave_one_out(gaussians, view).max_abs_change + 1
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 # Dynamo's own, wherever a graph goes on with a tensor that has a history.
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf")
 def test_compiled_around_the_op_it_is_the_same_without_a_warning():

@@ -87,7 +87,7 @@ def test_it_compiles_for_arm(tmp_path):
     assert b"x86-64-v3" not in library
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 def test_macos_gets_the_same_name_and_the_openmp_runtime_of_torch(tmp_path):
     """The command that would link it, configured for macOS with the compiler that is here."""
     require("cmake", "make", "g++")
@@ -98,7 +98,7 @@ def test_macos_gets_the_same_name_and_the_openmp_runtime_of_torch(tmp_path):
     assert not [word for word in words if "omp" in word.lower()]
 
 
-@pytest.mark.lengthy
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads what Linux says of a process")
 def test_a_process_has_one_openmp_runtime():
     """Two would each have their threads: ours must be known by the name that torch's has (pyproject.toml, wheels)."""

@@ -42,7 +42,7 @@ INSTANCE = """
                                            const Outputs<float>&, const Range&);
     }"""
 
-pytestmark = [pytest.mark.lengthy, pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")]
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")]
 
 
 def folder(place: Path, effects: str, replaced: dict[str, str]) -> Path:
@@ -60,9 +60,7 @@ def compiled(place: Path, *options: str, file: str = "instance.cpp") -> subproce
     return subprocess.run(command, cwd=place, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.parametrize(
-    "target", ["baseline", *(pytest.param(name, marks=pytest.mark.slow) for name in [*TARGETS][1:])]
-)
+@pytest.mark.parametrize("target", TARGETS)
 def test_without_effects_the_projection_is_the_same_machine_code(tmp_path, target):
     objects = []
     for name, replaced in (("with", {}), ("without", EMPTY)):

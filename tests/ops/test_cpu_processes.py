@@ -9,7 +9,7 @@ import pytest
 
 from sparsestreet.ops.cpu.library import find_library
 
-pytestmark = pytest.mark.lengthy
+pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
 SCENE = """
 import torch

@@ -8,6 +8,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops import backend as fused
 from sparsestreet.ops.activate import activate
+from sparsestreet.ops.adam import AdamStep, adam_rows_
 from sparsestreet.ops.backend import fused_backend
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import RawGaussians
@@ -23,15 +24,24 @@ TRACKS = Trajectories(
 IMAGE = torch.zeros(11, 11, 3)
 CAMERA = Camera(torch.eye(4), torch.eye(3), width=11, height=11)
 STEPS = {
-    "activate.activate": lambda backend: activate([ROWS], sh_degree=0, backend=backend),
-    "poses.poses_at": lambda backend: poses_at(
-        TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend
+    "adam": lambda backend: adam_rows_(
+        *torch.zeros(4, 2, 3), torch.zeros(2).long(), AdamStep(1, 0.1), width=3, backend=backend
     ),
-    "sky.over_sky": lambda backend: over_sky(
+    "activate": lambda backend: activate([ROWS], sh_degree=0, backend=backend),
+    "poses": lambda backend: poses_at(TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend),
+    "sky": lambda backend: over_sky(
         IMAGE, IMAGE[..., 0], torch.zeros(6, 1, 1, 3), CAMERA, transmittance_min=0.1, backend=backend
     ),
-    "ssim.mean_ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
+    "ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
 }
+PLACES = {
+    "adam": {"cpu": "adam.step_rows_in_library_", "triton": "triton.adam.step_finite_rows_"},
+    "activate": {"cpu": "cpu.rows.activate", "triton": "triton.activate.activate"},
+    "poses": {"cpu": "cpu.rows.poses_at", "triton": "triton.poses.poses_at"},
+    "sky": {"cpu": "cpu.images.over_sky", "triton": "triton.sky.over_sky"},
+    "ssim": {"cpu": "cpu.images.mean_ssim", "triton": "triton.ssim.mean_ssim"},
+}
+"""Where each implementation lies in sparsestreet.ops."""
 
 
 @pytest.fixture
@@ -83,13 +93,10 @@ def test_the_named_implementation_runs(monkeypatch, step, backend):
     # Torch's numbers would be as good.
     ran = RuntimeError(f"{backend} ran")
 
-    def run(*_):
+    def run(*_, **__):
         raise ran
 
-    module, name = step.split(".")
-    if backend == "cpu":
-        module = "rows" if module in ("activate", "poses") else "images"
-    monkeypatch.setattr(f"sparsestreet.ops.{backend}.{module}.{name}", run)
+    monkeypatch.setattr(f"sparsestreet.ops.{PLACES[step][backend]}", run)
     with pytest.raises(RuntimeError, match=str(ran)):
         STEPS[step](backend)
 

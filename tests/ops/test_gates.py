@@ -34,7 +34,7 @@ STOPS = {
     "exact": SplatSettings.preset("exact"),
     "antialias": SplatSettings(antialias=True),
 }
-# Bars of the op, as in test_cpu_parity.py.
+# Bars of the op, as in test_parity.py.
 IMAGE_BAR = {torch.float32: 1e-5, torch.float64: 1e-12}
 GRADIENT_BAR = {torch.float32: 1e-4, torch.float64: 1e-10}
 BY_HAND = {torch.float32: 1e-6, torch.float64: 1e-12}

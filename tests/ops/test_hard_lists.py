@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, contribution, leave_one_out, splat
+from sparsestreet.ops import SplatSettings, contribution, leave_one_out
 from sparsestreet.ops.cpu.library import idle_workspaces
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -88,14 +88,19 @@ def test_16_numbers_of_every_row_are_written(backend, dtype):
     rows = [one_gaussian(means=[[0.0, 0.0, -2.0]]), *stack, one_gaussian(opacities=[0.0])]
     scene = cast(Gaussians.concatenate(rows), dtype, device=device_of(backend))
 
+    drawn: list[list[torch.Tensor]] = []
+
     def counted() -> dict[str, torch.Tensor]:
         counters = [vars(count(scene, view, backend=backend)) for count in (contribution, leave_one_out)]
-        return counters[0] | counters[1] | {"radii": splat(scene, view, backend=backend).radii}
+        seen = render(Gaussians.concatenate(rows), view, backend, dtype)
+        drawn.append([*seen.images.values(), *seen.gradients.values()])
+        return counters[0] | counters[1] | {"radii": seen.radii}
 
     expected = counted()
     with pytest.MonkeyPatch.context() as patch:
         _poison(patch)
         result = counted()
+    assert all(map(torch.equal, *drawn))
     for name, value in expected.items():
         assert torch.equal(value, result[name]), name
         assert value[1:-1].any(), f"{name}: the scene tests nothing"

@@ -95,7 +95,6 @@ def test_01_extreme_scenes_are_right(backend, dtype):
 
 
 @every_backend
-# On Triton's kernels 1e25 is a smaller test (triton/test_edges.py).
 @pytest.mark.parametrize(
     "case", first_interpreted((1e12, False), (1e12, True), (1e25, False)), ids=lambda case: f"{case[0]:g}-{case[1]}"
 )

@@ -68,7 +68,6 @@ def _found(compiled: CompiledKernel, instructions: list[tuple[int, str]]) -> dic
         "loops": loops,
         "loads": sum(text.startswith("LDG") for _, text in instructions),
         "stores": sum(text.startswith("STG") for _, text in instructions),
-        "tiles": _tiles(compiled.asm["ttgir"]),
         "code": hashlib.sha256(repr(instructions).encode()).hexdigest(),
     }
 
@@ -126,19 +125,6 @@ def _listed(tool: str, code: bytes, *options: str) -> str:
         Path(file.name).write_bytes(code)
         command = [_TOOLS / tool, *options, file.name]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
-
-
-def _tiles(ttgir: str) -> list[dict]:
-    """Loads and stores of tiles [rows, columns] in blocked layouts: numbers that a lane holds, lanes on both axes."""
-    lists = r"sizePerThread = \[(.*?)\], threadsPerWarp = \[(.*?)\], warpsPerCTA = \[.*?\], order = \[1, 0\]"
-    layouts = {name: found for name, *found in re.findall(rf"^(#\w+) = #ttg.blocked<{{{lists}}}>", ttgir, re.MULTILINE)}
-    tiles = []
-    for kind, rows, columns, layout in re.findall(
-        r"tt\.(load|store) .*tensor<(\d+)x(\d+)x!tt\.ptr<f32>, (#blocked\w*)>", ttgir
-    ):
-        held, lanes = ([int(number) for number in text.split(",")] for text in layouts[layout])
-        tiles.append({"kind": kind, "shape": [int(rows), int(columns)], "held": held, "lanes": lanes})
-    return tiles
 
 
 def _loops(instructions: list[tuple[int, str]]) -> list[dict[str, int]]:

@@ -1,7 +1,4 @@
-"""The fused steps of training compile for sm_80 and sm_90 without a GPU, and keep everything in registers.
-
-``make test`` compiles the largest of each kernel for sm_90, ``make test-all`` the smallest too, and for both.
-"""
+"""The fused steps of training compile for sm_80 and sm_90 without a GPU, and keep everything in registers."""
 
 from dataclasses import replace
 
@@ -24,8 +21,7 @@ from tests.ops.test_poses import MAX_GAP
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
 from tests.ops.triton.test_poses import on_device
 
-# One process compiles for all tests.
-pytestmark = pytest.mark.lengthy
+pytestmark = pytest.mark.slow
 DEVICE = device_of("triton")
 # Measured with Triton 3.7.1: 64, 94, 41, 64, 22, 32, 40, 64, 64. A streaming multiprocessor has 65536 registers: at 32
 # in each lane it holds all the warps it can, at 64 half of them. Rows take many, because 16 coefficients are on their
@@ -39,27 +35,13 @@ REGISTERS = {
 STACK = {"interpolate": 32, "interpolate_backward": 32}
 
 
-SCOPES = [
-    pytest.param((90, False), id="largest, sm_90", marks=pytest.mark.slow),
-    pytest.param((90, True), id="all, sm_90", marks=pytest.mark.slow),
-    pytest.param((80, True), id="all, sm_80", marks=pytest.mark.slow),
-]
-
-
-@pytest.fixture(scope="module", params=SCOPES)
-def scope(request) -> tuple[int, bool]:
-    """Architecture, and whether the smallest kernels are compiled too."""
-    return request.param
-
-
-@pytest.fixture(scope="module")
-def compiled(scope) -> list[tuple[Launch, dict]]:
-    arch, smallest_too = scope
+@pytest.fixture(scope="module", params=[80, 90], ids=["sm_80", "sm_90"])
+def compiled(request) -> list[tuple[Launch, dict]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
         launches = record_launches(monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim))
-        launch_nodes(smallest_too)
-        launch_images(smallest_too)
-        for shape in ((2, 15, 3), (2, 3))[: 1 + smallest_too]:
+        launch_nodes()
+        launch_images()
+        for shape in ((2, 15, 3), (2, 3)):
             values, gradient, first, second = (torch.zeros(shape, device=DEVICE) for _ in range(4))
             adam_step_(
                 values,
@@ -73,33 +55,33 @@ def compiled(scope) -> list[tuple[Launch, dict]]:
             refused = torch.zeros(2, dtype=torch.int64, device=DEVICE)
             width = values[0].numel()
             adam_rows_(values, gradient, first, second, refused, AdamStep(1, 0.1), width=width, backend="triton")
-    return compile_launches(launches, arch)
+    return compile_launches(launches, request.param)
 
 
-def launch_nodes(smallest_too: bool) -> None:
-    for rest, degree, masked, placed in ((15, 3, True, True), (0, 0, False, False))[: 1 + smallest_too]:
+def launch_nodes() -> None:
+    for rest, degree, masked, placed in ((15, 3, True, True), (0, 0, False, False)):
         inputs, run = case(rest, degree, masked, placed, torch.float32, count=2, device=DEVICE)
         activated(inputs, lambda run=run: run("triton"))
     table, deltas = on_device(0.3)
     poses_at(table, *deltas, 0.3, MAX_GAP, backend="triton").translations.sum().backward()
 
 
-def launch_images(smallest_too: bool) -> None:
+def launch_images() -> None:
     image = torch.zeros(11, 11, 3, device=DEVICE)
     ssim(image, image, backend="triton")
     ssim(image.requires_grad_(), image, backend="triton").backward()
     texels = torch.zeros(6, 2, 2, 3, device=DEVICE)
-    for view in (replace(camera(11, 11), distortion=torch.zeros(5)), camera(11, 11))[: 1 + smallest_too]:
+    for view in (replace(camera(11, 11), distortion=torch.zeros(5)), camera(11, 11)):
         over_sky(image, image[..., 0], texels, view, transmittance_min=0.1, backend="triton").sum().backward()
 
 
-def test_every_kernel_is_compiled(compiled, scope):
+def test_every_kernel_is_compiled(compiled):
     of_two_sizes = [
         "activate_rows", "activate_rows_backward", "lay_over_sky", "lay_over_sky_backward", "step_numbers",
         "step_finite_rows",
     ]  # fmt: skip
     of_one = ["interpolate", "interpolate_backward", "similarity", "similarity", "similarity_backward"]
-    expected = [*of_one, *of_two_sizes * (1 + scope[1])]
+    expected = [*of_one, *of_two_sizes * 2]
     assert sorted(launch.name for launch, _ in compiled) == sorted(expected)
 
 

@@ -21,8 +21,8 @@ from tests.ops.scenes import (
     relative_error,
 )
 from tests.ops.test_gates import gated
+from tests.ops.test_parity import EFFECTS
 from tests.ops.triton.splitting import Rule, split_by
-from tests.ops.triton.test_parity import EFFECTS
 from tests.ops.triton.test_parts import stack
 from tests.typed import there
 
@@ -52,7 +52,7 @@ def moving() -> tuple[Gaussians, Tensor, Camera]:
     gates = torch.rand(9, generator=generator).round(decimals=1).double()
     gates[::3] = 0.0
     gaussians = replace(random_gaussians(9, view, terms=1), displacements=moves)
-    return gaussians, gates, replace(view, **EFFECTS["lens_and_shutter"])
+    return gaussians, gates, replace(view, **EFFECTS["lens and shutter"])
 
 
 def assert_all_say_the_same(

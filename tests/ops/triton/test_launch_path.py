@@ -12,9 +12,6 @@ from triton.runtime.jit import KernelInterface
 from sparsestreet.ops.triton import launch
 from tests.ops.triton.recording import run_compiler
 
-# One process compiles for all tests.
-pytestmark = pytest.mark.lengthy
-
 FORWARD = [
     "project_rows", "list_visible", "list_pairs", "bound_tiles", "order_tiles", "blend_tiles",
     "blend_tiles", "compose_pixels",
@@ -102,6 +99,7 @@ KNOWN = {"to": "16", "values": "16", "factor": "", "count": ""}
 TYPES = ["*fp32", "*fp32", "i32", "i32"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "known", "types"),
     [
@@ -127,12 +125,14 @@ def test_a_launch_gets_the_kernel_of_its_arguments(alike, name, known, types):
         assert found["types"] == [kind for kind in wanted if kind != "constexpr"]
 
 
+@pytest.mark.slow
 def test_only_the_first_of_launches_alike_is_bound(alike):
     assert alike["plain"][0]["bound"]
     assert not alike["another plain"][0]["bound"]
     assert not any(later["bound"] for _, *others in alike.values() for later in others)
 
 
+@pytest.mark.slow
 def test_what_is_no_argument_is_part_of_the_kernel_too(alike):
     codes = {
         alike[name][i]["code"] for name in ("plain", "other constant", "other block", "other options") for i in range(3)
@@ -142,6 +142,7 @@ def test_what_is_no_argument_is_part_of_the_kernel_too(alike):
     assert alike["count of one"][0]["code"] == alike["plain"][0]["code"]
 
 
+@pytest.mark.slow
 def test_an_unknown_triton_binds_every_launch(launched):
     assert [found["bound"] for found in launched["3.12.0"]] == [True, True]
 

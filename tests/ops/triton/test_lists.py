@@ -1,16 +1,27 @@
 """The tiles' lists: brute force over pixels as the oracle, on a grid that is not square."""
 
+import dataclasses
 import math
 
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings, splat
+from sparsestreet.ops import SplatSettings, contribution, leave_one_out, splat
+from sparsestreet.ops.triton import lists
 from sparsestreet.ops.triton.parts import split_length
 from sparsestreet.ops.triton.screen import Screen, project
 from sparsestreet.ops.triton.view import KernelView
-from sparsestreet.types import Camera, Gaussians
-from tests.ops.scenes import camera, cast, device_of, first_interpreted, front_camera, one_gaussian, random_gaussians
+from sparsestreet.types import Camera, Gaussians, Shutter
+from tests.ops.scenes import (
+    camera,
+    cast,
+    device_of,
+    first_interpreted,
+    front_camera,
+    one_gaussian,
+    random_gaussians,
+    render,
+)
 from tests.ops.triton.splitting import Rule, split_by
 
 DEVICE = device_of("triton")
@@ -22,11 +33,11 @@ DEPTH = 10
 
 def listed(screen: Screen) -> set[tuple[int, int]]:
     """(row, tile) of every pair, as the pixel kernels walk them."""
-    lists, pairs = screen.lists, set()
-    for tile in range(len(lists.begins)):
-        rows = lists.rows_of_pairs[int(lists.begins[tile]) : int(lists.ends[tile])].tolist()
+    found, pairs = screen.lists, set()
+    for tile in range(len(found.begins)):
+        rows = found.rows_of_pairs[int(found.begins[tile]) : int(found.ends[tile])].tolist()
         pairs |= {(row, tile) for row in rows}
-    assert len(pairs) == len(lists.pair_rows)
+    assert len(pairs) == len(found.pair_rows)
     return pairs
 
 
@@ -143,6 +154,31 @@ def test_more_pairs_than_tiles():
     scene = Gaussians.concatenate([one_gaussian(means=[[0.0, 0.0, 2 + 0.01 * k]]) for k in range(300)])
     screen = project(cast(scene, torch.float32, device=DEVICE), KernelView(front_camera(9, 5, 20.0), SplatSettings()))
     assert screen.lists.rows_of_pairs.tolist() == list(range(300))
+
+
+def test_many_tiles_take_wide_keys(monkeypatch):
+    view = camera(19, 17)
+    gaussians = random_gaussians(6, view)
+    plain = render(gaussians, view, "triton", torch.float32)
+    monkeypatch.setattr(lists, "_SHORT_KEYS", 2)
+    wide = render(gaussians, view, "triton", torch.float32)
+    for part in ("images", "gradients"):
+        assert all(torch.equal(value, getattr(wide, part)[name]) for name, value in getattr(plain, part).items())
+
+
+@pytest.mark.parametrize("laid_out", first_interpreted("transposed", "expanded"))
+def test_displacements_in_any_layout(laid_out):
+    view = dataclasses.replace(camera(9, 7), shutter=Shutter(torch.full((3,), 0.1), torch.zeros(3)))
+    moved = torch.linspace(-0.5, 0.5, 18, device=DEVICE).view(3, 6).mT
+    if laid_out == "expanded":
+        moved = torch.tensor([0.3, -0.4, 0.2], device=DEVICE).expand(6, 3)
+    assert not moved.is_contiguous()
+    scene = cast(random_gaussians(6, view), torch.float32, device=DEVICE)
+    strided, compact = (dataclasses.replace(scene, displacements=m) for m in (moved, moved.contiguous()))
+    assert torch.equal(*(splat(g, view, backend="triton").rgb for g in (strided, compact)))
+    for count in (contribution, leave_one_out):
+        found, expected = (vars(count(g, view, backend="triton")) for g in (strided, compact))
+        assert all(torch.equal(found[name], value) for name, value in expected.items())
 
 
 @pytest.mark.parametrize(("edge", "distance"), [("left", 9), ("right", 8), ("top", 9), ("bottom", 8)])

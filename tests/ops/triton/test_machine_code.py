@@ -1,9 +1,5 @@
 """Every kernel compiles for sm_80, sm_90 and sm_120 without a GPU, and the pixel loops stay within their budgets.
 
-What has a budget or is launched beside training is compiled for sm_90 by ``make test``, with the switches of training;
-the rest of training's kernels as they are launched (test_launch_path.py). ``make test-all`` compiles every switch for
-all three.
-
 Budgets are what was measured with Triton 3.7.1; 3.6.0 makes pixel kernels of the same registers and instructions. The
 instructions of a (splat, pixel) sample are those of a splat that touches all four quadrants of its tile: the
 costliest. Of one that touches two it is a third less for the pair, where a kernel that took the tile as a whole had 154
@@ -13,7 +9,6 @@ forward and 487 backward whatever it touched.
 import dataclasses
 import itertools
 import json
-from functools import cache
 
 import pytest
 import torch
@@ -25,11 +20,7 @@ from sparsestreet.types import Shutter
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
 from tests.ops.triton.splitting import Rule, split_by
-from tests.ops.triton.test_launch_path import BACKWARD as BACKWARD_PASS
-from tests.ops.triton.test_launch_path import FORWARD as FORWARD_PASS
 
-# One process compiles for all tests.
-pytestmark = pytest.mark.lengthy
 DEVICE = device_of("triton")
 
 STILL = camera(5, 4)
@@ -42,13 +33,11 @@ VIEWS = {
     "columns": dataclasses.replace(STILL, shutter=dataclasses.replace(SHUTTER, direction="left")),
     "both": dataclasses.replace(STILL, distortion=LENS, shutter=SHUTTER),
 }
-# Terms of harmonics, view, whether rows move, settings, what is differentiated.
-TRAINED = [
+# Terms of harmonics, view, whether rows move, settings, what is differentiated: what trains, each switch on and off,
+# the largest case of the row kernels, and the kernels that stand beside gsplat's.
+CASES = [
     (16, "plain", False, SplatSettings(), "rgb"),
     (1, "plain", False, SplatSettings(), "depth"),
-]
-# Each switch on and off, the largest case of the row kernels, and the kernels that stand beside gsplat's.
-OTHERS = [
     (16, "plain", False, SplatSettings.preset("gsplat15"), "rgb"),
     (1, "plain", False, SplatSettings(stop="exclusive", antialias=True), "depth"),
     (9, "plain", False, SplatSettings(half_colors=True), "rgb"),
@@ -66,13 +55,11 @@ _BACKWARD = ("unscented", "unscented_backward", "roll", "roll_backward", "veloci
 EFFECTS = {"project_rows": _FORWARD, "project_rows_backward": _BACKWARD}
 
 
-def launches_of(
-    monkeypatch: pytest.MonkeyPatch, cases: list[tuple], stops: tuple[StopRule, ...], choices: list[Rule]
-) -> list[Launch]:
-    """What these cases launch, and all that is counted, with these rules of where a pixel stops and these choices for
-    split tiles."""
+def launches_of(monkeypatch: pytest.MonkeyPatch) -> list[Launch]:
+    """What the cases launch, and all that is counted, with both rules of where a pixel stops and with split tiles."""
+    stops: tuple[StopRule, ...] = ("inclusive", "exclusive")
     launches = record_launches(monkeypatch)
-    for terms, name, moves, settings, output in cases:
+    for terms, name, moves, settings, output in CASES:
         scene = cast(random_gaussians(3, STILL, terms=terms), torch.float32, requires_grad=True, device=DEVICE)
         displacements = torch.ones(3, 3, device=DEVICE) if moves else None
         scene = dataclasses.replace(scene, displacements=displacements)
@@ -85,8 +72,8 @@ def launches_of(
         rasterizer.leave_one_out(scene, background, weights, STILL, SplatSettings())
     for stop in stops:
         contribution(scene, STILL, settings=SplatSettings(stop=stop), backend="triton")
-    for gates, choice, stop in itertools.product((None, torch.ones(3, device=DEVICE)), choices, stops):
-        with split_by(choice):
+    for gates, stop in itertools.product((None, torch.ones(3, device=DEVICE)), stops):
+        with split_by(Rule(min_part_pairs=1, min_parts=2)):
             splat(scene, STILL, backend="triton", settings=SplatSettings(stop=stop), gates=gates).depth.sum().backward()
     unique = {json.dumps(dataclasses.asdict(launch), sort_keys=True): launch for launch in launches}
     return list(unique.values())
@@ -98,66 +85,29 @@ def bare(launch: Launch, registers: int, **constants: bool) -> Launch:
     return dataclasses.replace(launch, constants=constants, options=launch.options | {"maxnreg": registers})
 
 
-SPLIT = Rule(min_part_pairs=1, min_parts=2)
-ALL = (TRAINED + OTHERS, ("inclusive", "exclusive"), [SPLIT])
-SCOPES = {
-    "trained, sm_90": (90, TRAINED, ("inclusive",), [SPLIT]),
-    "all, sm_80": (80, *ALL),
-    "all, sm_90": (90, *ALL),
-    "all, sm_120": (120, *ALL),
-}
-
-
-EVERYTHING = [pytest.param(name, marks=pytest.mark.slow) for name in [*SCOPES][1:]]
-
-
-@pytest.fixture(scope="module", params=["trained, sm_90", *EVERYTHING])
+@pytest.fixture(scope="module", params=[80, 90, 120], ids=["sm_80", "sm_90", "sm_120"])
 def compiled(request) -> list[tuple[Launch, dict]]:
-    return compiled_in(request.param)
-
-
-@pytest.fixture(scope="module", params=EVERYTHING)
-def everything(request) -> list[tuple[Launch, dict]]:
-    return compiled_in(request.param)
-
-
-@cache
-def compiled_in(scope: str) -> list[tuple[Launch, dict]]:
-    arch, cases, stops, choices = SCOPES[scope]
     with pytest.MonkeyPatch.context() as monkeypatch:
-        launches = launches_of(monkeypatch, cases, stops, choices)
-    if cases is TRAINED:
-        return compile_launches([launch for launch in launches if _is_daily(launch)], arch)
+        launches = launches_of(monkeypatch)
     first = {launch.name: launch for launch in reversed(launches) if launch.name.startswith("blend")}
     backward = first["blend_tiles_backward"]
     launches.append(bare(backward, 96, ABSOLUTE=False))
     launches.append(bare(backward, 104, ABSOLUTE=False, DEPTH=True))
     plain = [launch for launch in launches if launch.name in EFFECTS and _is_plain(launch)]
     launches += [dataclasses.replace(launch, without=EFFECTS[launch.name]) for launch in plain]
-    return compile_launches(launches, arch)
+    return compile_launches(launches, request.param)
 
 
-def _is_daily(launch: Launch) -> bool:
-    """Of what is compiled elsewhere only what has a budget, and of rows the largest."""
-    if launch.name in ROW_BUDGETS:
-        return launch.constants["TERMS"] == 16
-    if launch.name in BUDGETS:
-        return _switches(launch.constants) in OF_TRAINING[launch.name]
-    return launch.name not in (*FORWARD_PASS, *BACKWARD_PASS)
-
-
-def test_every_kernel_is_compiled(compiled, request):
-    names = {launch.name for launch, _ in compiled}
-    if "trained" in request.node.name:
-        assert names == {*BUDGETS, *ROW_BUDGETS, "count_tiles_pixels", "remove_from_tiles"}
-        names |= {*FORWARD_PASS, *BACKWARD_PASS}
-    assert names == {
+@pytest.mark.slow
+def test_every_kernel_is_compiled(compiled):
+    assert {launch.name for launch, _ in compiled} == {
         "project_rows", "list_visible", "list_pairs", "bound_tiles", "order_tiles", "blend_tiles",
         "count_tiles_pixels", "blend_tiles_backward", "sum_slots", "project_rows_backward", "remove_from_tiles",
         "compose_pixels", "decompose_pixels",
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_nothing_spills(compiled, request):
     """But 8 bytes outside the loop of the forward blend; on sm_120, where registers were not tuned, once in it."""
     newest = "sm_120" in request.node.name
@@ -167,6 +117,7 @@ def test_nothing_spills(compiled, request):
         assert sum(loop["spilled"] for loop in found["loops"]) <= (newest and is_forward), launch
 
 
+@pytest.mark.slow
 def test_no_tensor_cores_and_no_atomics(compiled):
     """Nothing is rounded to tf32, and no sum depends on who comes first."""
     assert [launch for launch, found in compiled if found["tensor_core"] or found["atomics"]] == []
@@ -194,20 +145,14 @@ BACKWARD = {
     "ABSOLUTE DEPTH TOGETHER": (104, 61.0),
     "ABSOLUTE DEPTH GATED TOGETHER": (112, 66.5),
 }
-OF_TRAINING = {
-    "blend_tiles": ("DEPTH LASTS", "DEPTH LASTS TOGETHER", "DEPTH GATED LASTS TOGETHER"),
-    "blend_tiles_backward": ("ABSOLUTE DEPTH TOGETHER", "ABSOLUTE DEPTH GATED TOGETHER"),
-}
-"""Of a kernel's variants those with the most loops and registers. The others are compiled by ``make test-all``."""
 BUDGETS = {"blend_tiles": FORWARD, "blend_tiles_backward": BACKWARD}
 
 
+@pytest.mark.slow
 def test_budget_of_the_pixel_loops(compiled):
     loops = [(launch, _switches(launch.constants), found) for launch, found in compiled if launch.name in BUDGETS]
-    every_switch = any("EXCLUSIVE" in switches for _, switches, _ in loops)
-    wanted = [(name, switches) for name, budgets in BUDGETS.items() for switches in budgets]
     assert {(launch.name, switches) for launch, switches, _ in loops} == {
-        (name, switches) for name, switches in wanted if every_switch or switches in OF_TRAINING[name]
+        (name, switches) for name, budgets in BUDGETS.items() for switches in budgets
     }
     for launch, switches, found in loops:
         registers, instructions = BUDGETS[launch.name][switches]
@@ -225,13 +170,14 @@ def _switches(constants: dict) -> str:
     return " ".join(sorted(name for name, value in constants.items() if value is True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EFFECTS)
-def test_effects_that_are_off_are_not_in_the_row_kernels(everything, name):
+def test_effects_that_are_off_are_not_in_the_row_kernels(compiled, name):
     """They are the same machine code where the functions of the effects do not exist."""
     whole, without = (
         [
             found["code"]
-            for launch, found in everything
+            for launch, found in compiled
             if launch.name == name and bool(launch.without) == missing and _is_plain(launch)
         ]
         for missing in (False, True)
@@ -244,6 +190,7 @@ def test_effects_that_are_off_are_not_in_the_row_kernels(everything, name):
 ROW_BUDGETS = {"project_rows": (54, 7, 128), "project_rows_backward": (50, 22, 128)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROW_BUDGETS)
 def test_budget_of_the_row_kernels(compiled, name):
     found = [found for launch, found in compiled if launch.name == name and _is_still(launch, terms=16)]
@@ -252,67 +199,6 @@ def test_budget_of_the_row_kernels(compiled, name):
         assert each["loads"] <= ROW_BUDGETS[name][0]
         assert each["stores"] <= ROW_BUDGETS[name][1]
         assert each["registers"] <= ROW_BUDGETS[name][2]
-
-
-# Numbers in a row of the tables that are read and written as tiles, in the order of the kernels.
-TABLES = {
-    "project_rows": {"load": ("TERMS",), "store": (12,)},
-    "project_rows_backward": {"load": ("SUMS", "TERMS", 4), "store": ("TERMS", 4)},
-}
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_lanes_side_by_side_take_numbers_side_by_side(compiled, name):
-    """Of tiles no more than 1.5 times the sectors of 32 bytes are asked for that their rows fill."""
-    checked = 0
-    for launch, found in compiled:
-        if launch.name != name or not _is_still(launch):
-            continue
-        for kind, counts in TABLES[name].items():
-            tiles = iter([tile for tile in found["tiles"] if tile["kind"] == kind])
-            for count in (_length(launch, counted) for counted in counts):
-                asked, first = 0, 0
-                while first < count:
-                    tile = next(tiles)
-                    asked += _sectors(tile, count, first)
-                    first += tile["shape"][1]
-                assert asked <= 1.5 * tile["shape"][0] * count * 4 / 32, (launch, kind, count)
-                checked += 1
-            assert not list(tiles)
-    assert checked
-
-
-def _length(launch: Launch, counted: int | str) -> int:
-    """Numbers of a row: of colors by their terms, of others as they are."""
-    if isinstance(counted, int):
-        return counted
-    return launch.constants[counted] * (3 if counted == "TERMS" else 1)
-
-
-def _sectors(tile: dict, count: int, first: int) -> int:
-    """Sectors that the instructions of a tile ask for: columns from ``first`` on of rows of ``count`` numbers."""
-    (rows, columns), (one, held), lanes = tile["shape"], tile["held"], tile["lanes"]
-    assert one == 1
-    asked = 0
-    # One instruction of a warp: a number of rows, and of columns.
-    for top in range(0, rows, lanes[0]):
-        for left in range(0, columns, held * lanes[1]):
-            places = {
-                row * count + first + column
-                for row in range(top, top + lanes[0])
-                for column in range(left, min(left + held * lanes[1], columns))
-                if first + column < count
-            }
-            asked += len({4 * place // 32 for place in places})
-    return asked
-
-
-def test_sectors_by_hand():
-    # 32 lanes with a row of 192 bytes each, number by number: 32 sectors an instruction. Of 64 bytes together: two.
-    alone = {"shape": [32, 16], "held": [1, 1], "lanes": [32, 1]}
-    together = {"shape": [32, 16], "held": [1, 4], "lanes": [8, 4]}
-    assert _sectors(alone, 48, 16) == 16 * 32
-    assert _sectors(together, 48, 16) == 4 * 8 * 2
 
 
 def _is_still(launch: Launch, terms: int | None = None) -> bool:
@@ -324,6 +210,7 @@ def _is_plain(launch: Launch) -> bool:
     return launch.constants["TERMS"] == 1 and not (launch.constants["DISTORTED"] or launch.constants["ROLLING"])
 
 
+@pytest.mark.lengthy
 def test_effects_do_not_touch_the_pixel_kernels(monkeypatch):
     launches = record_launches(monkeypatch)
     view, pixel_kernels = camera(5, 4), []

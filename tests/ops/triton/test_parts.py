@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import example, given, settings
@@ -198,3 +199,26 @@ def test_parts_cover_long_tiles_once(counts, length, limit, fewest, more):
     assert [int(end) for end in found.whole_ends] == [
         int(begins[tile] if tile in long else ends[tile]) for tile in range(len(counts))
     ]
+
+
+STREETS = [
+    ({0: 0, 0.1: 40, 0.5: 529, 0.65: 800, 0.8: 1350, 0.9: 2268, 0.99: 3473, 1: 4958}, 2400),
+    ({0: 0, 0.1: 25, 0.5: 421, 0.65: 700, 0.8: 1150, 0.9: 2108, 0.97: 2900, 0.99: 4494, 1: 7925}, 2160),
+]
+"""Quantiles of the pairs of a tile, as counted on trained streets, and numbers of tiles."""
+
+
+@pytest.mark.parametrize(("quantiles", "tiles"), STREETS)
+def test_no_chain_of_a_street_is_longer_than_the_devices_share(quantiles, tiles):
+    """1.3 times what each of the 2640 warps of a large GPU has of all pairs; what a part lets through counts too."""
+    at = (np.arange(tiles) + 0.5) / tiles
+    lengths = np.random.default_rng(0).permutation(np.interp(at, [*quantiles], [*quantiles.values()]).round())
+    begins, _, _, found = lists_of(lengths.astype(int).tolist())
+    assert found is not None
+    chains = [*(found.whole_ends - begins).tolist(), *(2 * (found.ends - found.begins)).tolist()]
+    assert max(chains) <= 1.3 * lengths.sum() / 2640
+
+
+def test_no_tile_is_split_of_many_alike():
+    """Means of 300 to 6,000 pairs; fluctuations of a sixth."""
+    assert all(7 * mean // 6 <= split_length(mean * tiles) for mean in (300, 1000, 6000) for tiles in (2400, 9600))
