@@ -34,7 +34,12 @@ def off(camera: Camera, motion: torch.Tensor) -> Camera:
 
 
 def measured(
-    monkeypatch: pytest.MonkeyPatch, size: float, shared: Sequence[float] = (0.0,) * 6, *, lens: bool = False
+    monkeypatch: pytest.MonkeyPatch,
+    size: float,
+    shared: Sequence[float] = (0.0,) * 6,
+    *,
+    lens: bool = False,
+    jitter: float = FEATURE_NOISE,
 ) -> PoseNoise | None:
     """18 instants whose poses are off by turns of ``size`` pixels on each axis, and by what all of them share."""
     draw = torch.Generator().manual_seed(4)
@@ -45,11 +50,11 @@ def measured(
     for instant, motion in enumerate(motions):
         image = torch.zeros(120, 200, 3, dtype=torch.uint8)
         frames.append(Frame(off(true_camera(instant, lens), motion), instant / 17, instant, 0, image=image))
-    monkeypatch.setattr(poses, "street_points", lambda part, *_: seen_points(part, lens))
+    monkeypatch.setattr(poses, "street_points", lambda part, *_: seen_points(part, lens, jitter))
     return pose_noise(as_frames(frames), ())
 
 
-def seen_points(frames: Frames, lens: bool) -> StreetPoints:
+def seen_points(frames: Frames, lens: bool, jitter: float = FEATURE_NOISE) -> StreetPoints:
     """What the true cameras see of 80 points, in pixels with the noise of features; one in ten is a wrong match."""
     draw = torch.Generator().manual_seed(frames.views[0].indices[0])
     first = frames.views[0].indices[0]
@@ -57,7 +62,7 @@ def seen_points(frames: Frames, lens: bool) -> StreetPoints:
     observed, views, pixels = [], [], []
     for number, view in enumerate(frames.views):
         seen, _, inside = project(true_camera(view.indices[0], lens), places)
-        seen = seen + FEATURE_NOISE * torch.randn(80, 2, generator=draw)
+        seen = seen + jitter * torch.randn(80, 2, generator=draw)
         wrong = torch.rand(80, generator=draw) < 0.1
         seen[wrong] += 3 * torch.randn(int(wrong.sum()), 2, generator=draw)
         observed += torch.nonzero(inside).flatten().tolist()
@@ -89,6 +94,13 @@ def test_the_value_is_what_errors_move_images_by(monkeypatch: pytest.MonkeyPatch
 def test_right_poses_move_nothing(monkeypatch: pytest.MonkeyPatch):
     found = measured(monkeypatch, 0.0)
     assert found is not None
+    assert found.value < FEATURE_NOISE
+
+
+def test_the_noise_of_features_is_no_noise_of_poses(monkeypatch: pytest.MonkeyPatch):
+    found = measured(monkeypatch, 0.0, jitter=0.6)
+    assert found is not None
+    assert float(np.median(found.by_image)) > 0.1
     assert found.value < FEATURE_NOISE
 
 
