@@ -98,10 +98,10 @@ def test_right_poses_move_nothing(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_the_noise_of_features_is_no_noise_of_poses(monkeypatch: pytest.MonkeyPatch):
-    found = measured(monkeypatch, 0.0, jitter=0.6)
+    found = measured(monkeypatch, 0.0, jitter=0.4)
     assert found is not None
-    assert float(np.median(found.by_image)) > 0.1
-    assert found.value < FEATURE_NOISE
+    # Of twelve images half have less than their floor: what is left of the median is small beside it.
+    assert found.value < 0.5 * float(np.median(found.by_image))
 
 
 def test_what_all_images_share_is_no_noise(monkeypatch: pytest.MonkeyPatch):

@@ -88,7 +88,7 @@ class Drive(Plan):
         return cv2.projectPoints(seen, np.zeros(3), np.zeros(3), camera.intrinsics, np.array(LENS))[0][:, 0]
 
     def read_at(self, frame: int, camera: PlannedCamera, place) -> tuple[int, np.ndarray]:
-        """When the row or column that shows ``place`` (a function of the stamp) is read, and the pixel: by bisection."""
+        """When the row or column that shows ``place`` (of a stamp) is read, and its pixel, by bisection."""
         middle, direction = self.image_stamp(frame, camera), self.directions[camera.name]
         axis, sign = (0 if direction in (2, 4) else 1), (1 if direction in (1, 2) else -1)
         side = (camera.width, camera.height)[axis]
