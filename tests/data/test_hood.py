@@ -122,6 +122,14 @@ def test_frames_get_it_beside_their_own_masks():
     assert seen[COUNT].ego is None  # the other camera shows none
 
 
+def test_nothing_is_looked_for_in_held_out_frames():
+    found, read = frames(HOOD), set()
+    lazy = Frames(found.views, lambda view: read.add(view.frame_index) or found[view.frame_index])
+    log = replace(make_log(COUNT), frames=lazy, num_frames=COUNT, num_cameras=1)
+    StreetData(log, stride=4, offset=2, hood=0.02, dirt=0.02)
+    assert read == {index for index in range(COUNT) if index % 4 != 2}
+
+
 def test_training_and_held_out_frames_lose_its_pixels():
     log = make_log(COUNT)
     moving = as_frames([Frame.of(frame, image=frame.image) for frame in frames(HOOD)])

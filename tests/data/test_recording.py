@@ -96,6 +96,22 @@ def test_points_that_are_not_finite_are_left_out_and_gray_ones_are_told(broken):
     assert gray.startswith("the points of cloud.ply have no colors that are known")
 
 
+def test_points_far_from_the_origin_keep_their_millimeters():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([4e6, -2e6, 100.0])
+    ahead = torch.tensor([[0.123, 0.456, 5.789]], dtype=torch.float64)
+    recording = Recording(
+        name="a",
+        rig=[camera(FLAT)],
+        shots=[RecordedImage(0, 0, pose, key=None, stem="0")],
+        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
+        read_masks=lambda shot: {},
+        sweeps={0: LidarSweep(lambda: pose[:3, 3] + ahead)},
+    )
+    points = log_of(recording, cache_bytes=0, check=list).sweeps[0].points
+    torch.testing.assert_close(points.double(), ahead, rtol=0, atol=1e-6)  # float32 of 6 m
+
+
 def test_the_recording_car_has_no_returns():
     points = torch.tensor([[0.0, 0.5, 5.0], [0.0, 1.3, 5.0]], dtype=torch.float64)  # rows 11 and 15.8
     recording = Recording(

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from sparsestreet.ranks import LostProcessError
 from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
 from sparsestreet.training.callbacks.checkpoints import step_of
 from sparsestreet.training.callbacks.graceful_stop import TornStop
@@ -122,6 +123,17 @@ def test_a_full_disk_stops_no_training_but_is_an_error_at_the_end(tmp_path, capl
     with pytest.raises(OSError, match="no space left"):
         trainer.callbacks[0].on_train_end(trainer, trainer.system)
     assert contents(tmp_path) == {"last.ckpt": "2"}
+
+
+def test_a_lost_process_is_no_full_disk(tmp_path, monkeypatch):
+    trainer = trainer_in(tmp_path)
+
+    def lost(filepath: Path, **options: Any) -> None:
+        raise LostProcessError("another process does not answer")
+
+    monkeypatch.setattr(trainer, "save_checkpoint", lost)
+    with pytest.raises(LostProcessError):
+        trainer.walk(2)
 
 
 def test_the_newest_checkpoint_is_the_one_that_was_written_last(tmp_path):
