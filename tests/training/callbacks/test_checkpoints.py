@@ -70,6 +70,14 @@ def test_an_exception_leaves_the_step_that_was_done_and_a_finished_run_takes_it_
     assert contents(folder) == {"last.ckpt": "5"}
 
 
+def test_one_before_a_moment_has_the_last_step_before_what_happens_after_it(tmp_path):
+    """At 60 % of 10 steps something happens in step 6: the checkpoint is of step 5, and stays."""
+    system = make_system({"background": background(1)})
+    trainer = HalfWritten(system, [Checkpoints(tmp_path, every=100, before=(0.6,))], max_steps=10)
+    trainer.walk(10)
+    assert contents(tmp_path) == {"before_0.6.ckpt": "5"}
+
+
 def test_a_half_written_one_of_a_killed_process_goes(tmp_path):
     for name in (".last.99999.tmp.ckpt", "last.ckpt", "mine.tmp.ckpt"):
         (tmp_path / name).write_text("half")
