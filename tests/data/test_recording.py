@@ -196,6 +196,23 @@ def test_an_object_is_on_its_way_between_annotated_instants(
     assert turned == pytest.approx([0.01 * stamp for stamp in at], abs=1e-9)
 
 
+def test_a_box_between_two_has_the_size_of_the_one_before():
+    """The two boxes between the three that are annotated; the size of the object is the mean of all."""
+    boxes, stamps = moving([0, 2, 4], [100, 121, 141]), (100, 110, 121, 130, 141)
+    boxes.sizes[:, 0] = 1.0, 1.05, 1.09
+    shots = [
+        RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), None, "", stamp)
+        for frame, stamp in enumerate(stamps)
+    ]
+    black = torch.zeros(16, 24, 3, dtype=torch.uint8)
+    recording = Recording(
+        "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=stamps, boxes=[boxes],
+        annotated=frozenset({0, 2, 4}),
+    )  # fmt: skip
+    (track,) = log_of(recording, cache_bytes=0, check=list).tracks
+    assert track.size.tolist() == pytest.approx([(1.0 + 1.0 + 1.05 + 1.05 + 1.09) / 5, 1.0, 1.0], abs=1e-6)
+
+
 class Broken(RecordedReader):
     """One image, one mask and one sweep, of which none can be read."""
 

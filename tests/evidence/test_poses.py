@@ -9,6 +9,7 @@ import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence import poses
+from sparsestreet.evidence.bundle import Bundle
 from sparsestreet.evidence.poses import PoseNoise, pose_noise
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import project
@@ -108,6 +109,18 @@ def test_what_all_images_share_is_no_noise(monkeypatch: pytest.MonkeyPatch):
     found = measured(monkeypatch, 0.0, (0.0, 0.0, 0.0, 0.03, 0.0, 0.0))
     assert found is not None
     assert found.value < 2 * FEATURE_NOISE
+
+
+def test_what_is_constant_is_of_the_camera_that_has_most():
+    """Median corrections of 0.1 and 3, one of them by a wrong image; slopes are those of pixels a number."""
+    corrections = np.zeros((6, 6))
+    corrections[:3, 0], corrections[3:, 0] = 0.1, (3.0, 3.0, 50.0)
+    nothing, slopes = np.zeros((6, 6, 6, 6)), np.tile(np.eye(6), (6, 1, 1))
+    bundle = Bundle(corrections, slopes, nothing, np.full(6, 30))
+    cameras = np.array([0, 0, 0, 1, 1, 1])
+    none = np.zeros(0)
+    stretch = poses._Stretch(np.zeros((0, 2), np.int64), none, none, bundle, cameras, 30)
+    assert poses._constant([stretch]) == pytest.approx(3.0)
 
 
 def test_a_car_that_stands_says_nothing(monkeypatch: pytest.MonkeyPatch):

@@ -9,6 +9,7 @@ import torch
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.effects import Exposure, ExposureSettings, Finding, Sky, SkySettings, linearized
+from sparsestreet.scene.effects import exposure as exposure_module
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -229,6 +230,11 @@ def test_held_out_images_are_not_looked_at():
     sweeps = Sweeps(range(wall.INSTANTS), sweep)
     data = of(replace(log, frames=lazy, sweeps=sweeps), frozenset({5}))
     SETTINGS.build(data, SETTINGS.detect(data), torch.Generator())
+
+
+def test_times_increase_whatever_the_order_of_the_views():
+    seen = [View(CAMERA, time, frame, camera) for camera in (2, 0) for frame, time in ((0, 0.5), (1, 0.1), (2, 0.3))]
+    assert exposure_module._times(seen) == {0: [0.1, 0.3, 0.5], 2: [0.1, 0.3, 0.5]}
 
 
 def test_off_is_not_built():
