@@ -6,9 +6,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sparsestreet.data import datamodule
 from sparsestreet.data import hood as hood_module
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.hood import find_dirt, find_hoods, with_ego
+from sparsestreet.data.hood import Hood, find_dirt, find_hoods, with_ego
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.effects import DirtSettings
@@ -124,6 +125,24 @@ def test_frames_get_it_beside_their_own_masks():
     seen = with_ego(as_frames(every), {camera: hood.mask for camera, hood in hoods.items()})
     assert torch.equal(seen[0].ego, own | FOUND)
     assert seen[COUNT].ego is None  # the other camera shows none
+
+
+def test_nothing_is_looked_for_in_held_out_frames():
+    found, read = frames(HOOD), set()
+    lazy = Frames(found.views, lambda view: read.add(view.frame_index) or found[view.frame_index])
+    log = replace(make_log(COUNT), frames=lazy, num_frames=COUNT, num_cameras=1)
+    StreetData(log, stride=4, offset=2, hood=0.02, dirt=0.02)
+    assert read == {index for index in range(COUNT) if index % 4 != 2}
+
+
+def test_spots_on_the_lens_join_the_hood(monkeypatch: pytest.MonkeyPatch):
+    hood, spot = torch.zeros(2, HEIGHT, WIDTH, dtype=torch.bool)
+    hood[-6:], spot[2:9, 3:9] = True, True
+    monkeypatch.setattr(datamodule, "find_hoods", lambda *_: {0: Hood(hood, 0.0)})
+    monkeypatch.setattr(datamodule, "find_dirt", lambda *_: {0: Hood(spot, 0.0)})
+    log = replace(make_log(COUNT), frames=frames(None), num_frames=COUNT, num_cameras=1)
+    data = StreetData(log, stride=4, offset=2, hood=0.02, dirt=0.02)
+    assert torch.equal(data.split.train[0].ego, hood | spot)
 
 
 def test_training_and_held_out_frames_lose_its_pixels():

@@ -182,6 +182,19 @@ def test_where_no_camera_sees_a_point_all_of_them_count():
     assert log.radius == pytest.approx(1.1 * 50)
 
 
+def test_a_frame_has_the_stamp_of_its_first_image():
+    """The second camera fires 5 ns before the first."""
+    log = make_log(3, 2)
+    stamped = [
+        replace(frame, stamp=100 + 10 * index - 5 * camera, seconds=index - camera / 2)
+        for frame in log.frames
+        for index, camera in [frame.indices]
+    ]
+    log = replace(log, frames=as_frames(stamped))
+    assert log.stamps == {0: 95, 1: 105, 2: 115}
+    assert log.seconds == {0: -0.5, 1: 0.5, 2: 1.5}
+
+
 def test_two_objects_of_one_name_are_no_log():
     log = make_log(3)
     track = Track("a", "car", torch.tensor([0]), torch.eye(4, dtype=torch.float64)[None], torch.ones(3))

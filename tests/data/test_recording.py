@@ -105,6 +105,22 @@ def test_points_that_are_not_finite_are_left_out_and_gray_ones_are_told(broken):
     assert gray.startswith("the points of cloud.ply have no colors that are known")
 
 
+def test_points_far_from_the_origin_keep_their_millimeters():
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3, 3] = torch.tensor([4e6, -2e6, 100.0])
+    ahead = torch.tensor([[0.123, 0.456, 5.789]], dtype=torch.float64)
+    recording = Recording(
+        name="a",
+        rig=[camera(FLAT)],
+        shots=[RecordedImage(0, 0, pose, key=None, stem="0")],
+        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
+        read_masks=lambda shot: {},
+        sweeps={0: LidarSweep(lambda: pose[:3, 3] + ahead)},
+    )
+    points = log_of(recording, cache_bytes=0, check=list).sweeps[0].points
+    torch.testing.assert_close(points.double(), ahead, rtol=0, atol=1e-6)  # float32 of 6 m
+
+
 def test_the_recording_car_has_no_returns():
     points = torch.tensor([[0.0, 0.5, 5.0], [0.0, 1.3, 5.0]], dtype=torch.float64)  # rows 11 and 15.8
     recording = Recording(
@@ -187,6 +203,23 @@ def test_an_object_is_on_its_way_between_annotated_instants(
     assert track.world_from_object[:, 0, 3].tolist() == pytest.approx([stamp / 10 for stamp in at], abs=1e-9)
     turned = Rotation.from_matrix(track.world_from_object[:, :3, :3].numpy()).as_rotvec()[:, 2]
     assert turned == pytest.approx([0.01 * stamp for stamp in at], abs=1e-9)
+
+
+def test_a_box_between_two_has_the_size_of_the_one_before():
+    """The two boxes between the three that are annotated; the size of the object is the mean of all."""
+    boxes, stamps = moving([0, 2, 4], [100, 121, 141]), (100, 110, 121, 130, 141)
+    boxes.sizes[:, 0] = 1.0, 1.05, 1.09
+    shots = [
+        RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), None, "", stamp)
+        for frame, stamp in enumerate(stamps)
+    ]
+    black = torch.zeros(16, 24, 3, dtype=torch.uint8)
+    recording = Recording(
+        "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=stamps, boxes=[boxes],
+        annotated=frozenset({0, 2, 4}),
+    )  # fmt: skip
+    (track,) = log_of(recording, cache_bytes=0, check=list).tracks
+    assert track.size.tolist() == pytest.approx([(1.0 + 1.0 + 1.05 + 1.05 + 1.09) / 5, 1.0, 1.0], abs=1e-6)
 
 
 class Broken(RecordedReader):

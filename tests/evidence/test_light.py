@@ -41,6 +41,15 @@ def test_cut_off_pixels_are_counted_and_the_worst_image_is_named():
     assert found.clipped_error == pytest.approx(0.15 / 10**0.5)  # nine images of 0, one of 0.5
 
 
+def test_of_many_images_the_worst_has_its_own_frame():
+    """Of 80 not all are looked at, but the last one is."""
+    ten = frames(90, white=0.5)
+    many = [replace(ten[9 if index == 79 else 0], frame_index=index) for index in range(80)]
+    found = measured_light(as_frames(many))
+    assert found.images < 80
+    assert found.worst_frame == 79
+
+
 def test_a_lamp_of_one_color_is_not_cut_off():
     red = [replace(frame, image=frame.image.clone()) for frame in frames(90)]
     for frame in red:

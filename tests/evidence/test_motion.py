@@ -44,6 +44,14 @@ def test_a_camera_that_turns():
     assert found.pixels == pytest.approx(2.0, rel=1e-3)  # tan x = x + x^3 / 3
 
 
+def test_a_camera_that_looks_at_a_point_while_it_passes():
+    """To the right by 0.3 m and to the left by 0.03 rad: what is 10 m ahead stays, at 5 m half of the 6 px is left."""
+    passing = shutter(0.3, 0.0, 0.0, rotation=(0.0, -0.03, 0.0))
+    for depth, pixels in ((10.0, 0.0), (5.0, 3.0)):
+        found = readout_shear([view(passing)], Sweeps.of((sweep((0.0, 0.0, depth)),)))
+        assert found.pixels == pytest.approx(pixels, abs=1e-2)
+
+
 def test_without_lidar_points_are_ten_meters_away():
     assert readout_shear([view(shutter(0.3, 0.0, 0.0))], Sweeps.of(())).pixels == pytest.approx(3.0, rel=1e-3)
 

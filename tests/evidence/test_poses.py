@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sparsestreet.evidence.bundle import Bundle
 
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence import poses
@@ -34,7 +35,12 @@ def off(camera: Camera, motion: torch.Tensor) -> Camera:
 
 
 def measured(
-    monkeypatch: pytest.MonkeyPatch, size: float, shared: Sequence[float] = (0.0,) * 6, *, lens: bool = False
+    monkeypatch: pytest.MonkeyPatch,
+    size: float,
+    shared: Sequence[float] = (0.0,) * 6,
+    *,
+    lens: bool = False,
+    jitter: float = FEATURE_NOISE,
 ) -> PoseNoise | None:
     """18 instants whose poses are off by turns of ``size`` pixels on each axis, and by what all of them share."""
     draw = torch.Generator().manual_seed(4)
@@ -45,11 +51,11 @@ def measured(
     for instant, motion in enumerate(motions):
         image = torch.zeros(120, 200, 3, dtype=torch.uint8)
         frames.append(Frame(off(true_camera(instant, lens), motion), instant / 17, instant, 0, image=image))
-    monkeypatch.setattr(poses, "street_points", lambda part, *_: seen_points(part, lens))
+    monkeypatch.setattr(poses, "street_points", lambda part, *_: seen_points(part, lens, jitter))
     return pose_noise(as_frames(frames), ())
 
 
-def seen_points(frames: Frames, lens: bool) -> StreetPoints:
+def seen_points(frames: Frames, lens: bool, jitter: float = FEATURE_NOISE) -> StreetPoints:
     """What the true cameras see of 80 points, in pixels with the noise of features; one in ten is a wrong match."""
     draw = torch.Generator().manual_seed(frames.views[0].indices[0])
     first = frames.views[0].indices[0]
@@ -57,7 +63,7 @@ def seen_points(frames: Frames, lens: bool) -> StreetPoints:
     observed, views, pixels = [], [], []
     for number, view in enumerate(frames.views):
         seen, _, inside = project(true_camera(view.indices[0], lens), places)
-        seen = seen + FEATURE_NOISE * torch.randn(80, 2, generator=draw)
+        seen = seen + jitter * torch.randn(80, 2, generator=draw)
         wrong = torch.rand(80, generator=draw) < 0.1
         seen[wrong] += 3 * torch.randn(int(wrong.sum()), 2, generator=draw)
         observed += torch.nonzero(inside).flatten().tolist()
@@ -92,10 +98,29 @@ def test_right_poses_move_nothing(monkeypatch: pytest.MonkeyPatch):
     assert found.value < FEATURE_NOISE
 
 
+def test_the_noise_of_features_is_no_noise_of_poses(monkeypatch: pytest.MonkeyPatch):
+    found = measured(monkeypatch, 0.0, jitter=0.4)
+    assert found is not None
+    # Of twelve images half have less than their floor: what is left of the median is small beside it.
+    assert found.value < 0.5 * float(np.median(found.by_image))
+
+
 def test_what_all_images_share_is_no_noise(monkeypatch: pytest.MonkeyPatch):
     found = measured(monkeypatch, 0.0, (0.0, 0.0, 0.0, 0.03, 0.0, 0.0))
     assert found is not None
     assert found.value < 2 * FEATURE_NOISE
+
+
+def test_what_is_constant_is_of_the_camera_that_has_most():
+    """Median corrections of 0.1 and 3, one of them by a wrong image; slopes are those of pixels a number."""
+    corrections = np.zeros((6, 6))
+    corrections[:3, 0], corrections[3:, 0] = 0.1, (3.0, 3.0, 50.0)
+    nothing, slopes = np.zeros((6, 6, 6, 6)), np.tile(np.eye(6), (6, 1, 1))
+    bundle = Bundle(corrections, slopes, nothing, np.full(6, 30))
+    cameras = np.array([0, 0, 0, 1, 1, 1])
+    none = np.zeros(0)
+    stretch = poses._Stretch(np.zeros((0, 2), np.int64), none, none, bundle, cameras, 30)
+    assert poses._constant([stretch]) == pytest.approx(3.0)
 
 
 def test_a_car_that_stands_says_nothing(monkeypatch: pytest.MonkeyPatch):

@@ -101,6 +101,16 @@ def test_points_in_a_box_go_with_it_and_others_stay():
     torch.testing.assert_close(turned[:1], torch.tensor([[9.1, -1.9, 0.0]]))
 
 
+def test_a_point_at_a_corner_goes_too_whichever_way_the_box_stands():
+    """Turned so that a corner lies farther along x than any side is long."""
+    corner = torch.tensor([[1.99, 0.99, 0.74]])
+    for yaw in (0.0, -math.atan2(1, 2), 2.0):
+        turned = replace(car(TIMES), world_from_object=poses([0.0, 10.0, 10.0], [yaw] * 3))
+        turn = turned.world_from_object[0, :3, :3].float()
+        found = CarriedPoints(1.05 * corner @ turn.T, 0.2, 2, [turned]).at(0.25)
+        torch.testing.assert_close(found, 1.05 * corner @ turn.T + torch.tensor([5.0, 0.0, 0.0]))
+
+
 def test_at_their_own_time_points_cost_nothing():
     class Untouched(Track):
         @property

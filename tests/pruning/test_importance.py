@@ -4,12 +4,27 @@ import pytest
 import torch
 
 from sparsestreet.pruning import Importance, measure_importance
+from sparsestreet.ranks import Ranks
 from sparsestreet.types import Contribution
 
 
 def view(weight: list[float], pixels: list[int], dominant: list[int]) -> Contribution:
     counts = torch.tensor([pixels, dominant], dtype=torch.int64)
     return Contribution(torch.tensor(weight, dtype=torch.float64), *counts)
+
+
+class Twins(Ranks):
+    """Two processes that see the same."""
+
+    def sum(self, values: torch.Tensor) -> torch.Tensor:
+        return values.mul_(2)
+
+
+def test_several_processes_divide_by_the_views_of_all():
+    importance = Importance()
+    importance.add(view([3.0, 1.0], [4, 2], [3, 0]))
+    importance.add(view([1.0, 2.0], [4, 4], [1, 2]))
+    assert importance.scores(Twins(0, 2)).tolist() == importance.scores().tolist() == [0.5, 0.25]
 
 
 def test_scores_of_a_hand_computed_case():

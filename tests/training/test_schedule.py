@@ -33,6 +33,12 @@ def test_what_recurs_counts_images(images, shift):
     assert several == [math.ceil(step / images) for step in single]
 
 
+@pytest.mark.parametrize(("shift", "first"), [(0, 20), (7, 27)])
+def test_the_first_comes_a_whole_period_after_the_shift(shift, first):
+    interval = Interval(0.0, 1.0, every=20, shift=shift)
+    assert [step for step in range(1, 70) if interval.due(step, Course(100))] == [first, first + 20, first + 40]
+
+
 @pytest.mark.parametrize("steps", [7, 60, 100, 700, 2000, 30000])
 def test_steps_are_those_of_the_decimal_fraction(steps):
     """0.07 * 100 is 7.000000000000001 and 0.29 * 100 is 28.999999999999996 in floats: step 7 is in, step 29 as well."""

@@ -226,6 +226,16 @@ def test_training_logs_the_running_psnr_and_the_number_of_gaussians():
     assert [how["step"] for name, _, how in trainer.log_calls if name == "psnr"] == [0, 1, 2]
 
 
+def test_a_resumed_run_goes_on_with_the_mean_of_the_last_steps():
+    trainer, resumed = (StubTrainer(make_system({"background": background(3)}), max_steps=10) for _ in range(2))
+    trainer.train(2, frame_at())
+    checkpoint: dict[str, Any] = {}
+    trainer.system.on_save_checkpoint(checkpoint)
+    resumed.system.on_load_checkpoint(checkpoint)
+    assert list(resumed.system.train_psnr) == list(trainer.system.train_psnr)
+    assert len(resumed.system.train_psnr) == 2
+
+
 def test_between_two_logs_nothing_is_computed_for_them():
     trainer = StubTrainer(make_system({"background": background(3)}))
     trainer.log_every_n_steps = 3

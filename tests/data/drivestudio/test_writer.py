@@ -197,7 +197,9 @@ def test_boxes_with_stamps_of_their_own_are_moved_to_those_of_their_frames(every
     times = torch.linspace(start, 3 / 3.2, 4, dtype=torch.float64) + 0.03 / 0.32
     poses = track.world_from_object.clone()
     poses[:, 0, 3] += torch.arange(4)
-    late = replace(everything, tracks=(replace(track, times=times, world_from_object=poses, body=None),))
+    moving = replace(track, times=times, world_from_object=poses, body=None)
+    parked = replace(track, name="1", times=times, body=None)
+    late = replace(everything, tracks=(moving, parked))
     assert end == 1.0
     found = written(late, tmp_path / "out").tracks[0]
     expected = poses[:, 0, 3] - 0.3
@@ -206,7 +208,7 @@ def test_boxes_with_stamps_of_their_own_are_moved_to_those_of_their_frames(every
     )  # stamps are rounded to ns
     (said,) = LOSSLESS.losses(late)
     assert said == (
-        "boxes are up to 30.0 ms from the stamps of their frames (objects: 1), and moved there, by up to 0.3 m"
+        "boxes are up to 30.0 ms from the stamps of their frames (objects: 2), and moved there, by up to 0.3 m"
     )
 
 

@@ -179,6 +179,23 @@ def test_points_in_other_files(written):
     np.testing.assert_allclose(sweeps[0].read().numpy(), PLAN.world_points(0), atol=1e-9)
 
 
+def test_what_is_near_goes_with_its_times(written):
+    folder, content = written
+    content["lidar"]["nearest"] = 10.0
+    write_json(folder, content)
+    for frame, sweep in there(RigJsonReader(root=folder).recording().sweeps).items():
+        far = np.linalg.norm(PLAN.sweep(frame)[0], axis=1) >= 10
+        assert 0 < far.sum() < len(far)
+        assert np.abs(sweep.read().numpy() - PLAN.world_points(frame)[far]).max() < CHORD
+
+
+def test_an_image_has_the_same_pose_in_any_window(root, recording):
+    """Images are taken after the stamp of their frame: those of a window's last one, beyond its path."""
+    own = {(shot.frame, shot.camera): shot.world_from_camera for shot in recording.shots}
+    for shot in RigJsonReader(root=root, first_frame=1, last_frame=2).recording().shots:
+        assert torch.equal(shot.world_from_camera, own[shot.frame + 1, shot.camera])
+
+
 def test_a_frame_without_images_is_left_out(written):
     folder, content = written
     del content["frames"][1]["images"]
@@ -200,6 +217,21 @@ def test_the_recording_car(written):
     frames = RigJsonReader(root=folder).read().frames
     assert frames[0].ego is None
     assert torch.equal(there(frames[1].ego), torch.from_numpy(hood > 0))
+
+
+def test_the_own_mask_and_the_given_one_are_one(written):
+    folder, content = written
+    own, given = np.zeros((2, 24, 32), np.uint8)
+    own[20:], given[:, :3] = 255, 255
+    Image.fromarray(own).save(folder / "hood.png")
+    content["cameras"]["left"]["ego_mask"] = "hood.png"
+    write_json(folder, content)
+    masks = folder / "masks/ego/left"
+    masks.mkdir(parents=True)
+    for frame in range(4):
+        Image.fromarray(given).save(masks / f"{frame:03d}.png")
+    frames = RigJsonReader(root=folder, masks=folder / "masks").read().frames
+    assert torch.equal(there(frames[1].ego), torch.from_numpy((own > 0) | (given > 0)))
 
 
 NUMBERS = {"fx": 30.0, "fy": 31.0, "cx": 16.0, "cy": 12.0, "u0": 16.0, "v0": 12.0}

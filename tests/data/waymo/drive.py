@@ -88,15 +88,17 @@ class Drive(Plan):
         return cv2.projectPoints(seen, np.zeros(3), np.zeros(3), camera.intrinsics, np.array(LENS))[0][:, 0]
 
     def read_at(self, frame: int, camera: PlannedCamera, place) -> tuple[int, np.ndarray]:
-        """When the column that shows ``place`` (a function of the stamp) is read, and the pixel: by bisection."""
-        middle, sign = self.image_stamp(frame, camera), 1 if self.directions[camera.name] == 2 else -1
+        """When the row or column that shows ``place`` (of a stamp) is read, and its pixel, by bisection."""
+        middle, direction = self.image_stamp(frame, camera), self.directions[camera.name]
+        axis, sign = (0 if direction in (2, 4) else 1), (1 if direction in (1, 2) else -1)
+        side = (camera.width, camera.height)[axis]
         low, high = middle - READOUT // 2, middle + READOUT // 2
         mount = camera.vehicle_from_camera
         while high - low > 1:
             stamp = (low + high) // 2
             (pixel,) = self.pixels(camera, self.world_from_vehicle(stamp) @ mount, place(stamp)[None])
-            column_stamp = middle + sign * (pixel[0] / camera.width - 0.5) * READOUT
-            low, high = (stamp, high) if column_stamp > stamp else (low, stamp)
+            read = middle + sign * (pixel[axis] / side - 0.5) * READOUT
+            low, high = (stamp, high) if read > stamp else (low, stamp)
         return low, self.pixels(camera, self.world_from_vehicle(low) @ mount, place(low)[None])[0]
 
     def box_stamp(self, frame: int) -> int:

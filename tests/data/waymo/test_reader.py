@@ -118,7 +118,7 @@ def test_points_lie_where_images_of_a_rolling_shutter_show_them(tmp_path):
     assert max(still) > 5
 
 
-@pytest.mark.parametrize("direction", [2, 4])
+@pytest.mark.parametrize("direction", [1, 2, 3, 4])
 def test_boxes_are_at_their_own_instants(direction, tmp_path):
     drive = Drive(directions={"front": direction, "left": 4})
     records.write_drive(tmp_path, drive)

@@ -10,7 +10,9 @@ import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence.poses import PoseNoise
-from sparsestreet.geometry.cameras import moved
+from sparsestreet.geometry import quaternions as quat
+from sparsestreet.geometry.cameras import inverse, moved
+from sparsestreet.geometry.trajectories import Trajectories, smoothed
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.scene.effects import Finding, camera_poses
 from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
@@ -273,6 +275,34 @@ def driven(frames: int, size: float) -> tuple[list[View], torch.Tensor]:
         views.append(View(camera_poses._moved(camera, error), frame / (frames - 1), frame, 0))
         undone.append(-error)
     return views, torch.stack(undone)
+
+
+def test_a_smooth_start_moves_centers_by_the_shift_alone_however_far_it_turns():
+    views, _ = driven(30, 0.05)
+    recorded = RecordedPoses(
+        [view.indices for view in views],
+        [view.time for view in views],
+        torch.stack([view.camera.camera_from_world for view in views]),
+    )
+    ends = inverse(recorded.poses.double())
+    times = torch.tensor([recorded.times])
+    path = Trajectories(
+        times,
+        quat.from_matrix(ends[:, :3, :3]).float()[None],
+        ends[None, :, :3, 3].float(),
+        torch.ones_like(times, dtype=torch.bool),
+        times[:, [0, -1]],
+    )
+    (turns,), (shifts,) = smoothed(path)
+    # To leave the turn out would move centers by their product.
+    assert (turns.norm(dim=1) * shifts.norm(dim=1)).max() > 0.01
+    for view, correction, turn, shift in zip(views, recorded.to_smooth_paths(), turns, shifts, strict=True):
+        own, found = (
+            inverse(c.camera_from_world.double()) for c in (view.camera, camera_poses._moved(view.camera, correction))
+        )
+        torch.testing.assert_close(found[:3, 3] - own[:3, 3], shift.double(), atol=1e-5, rtol=0)  # float32 at 30 m
+        wanted = own[:3, :3] @ quat.to_matrix(quat.from_rotation_vector(turn.double()))
+        torch.testing.assert_close(found[:3, :3], wanted, atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize(("after", "starts"), [(0.1, True), (0.9, False), (None, False)])

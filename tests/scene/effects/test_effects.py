@@ -123,6 +123,18 @@ def test_a_lens_is_simulated_where_it_moves_pixels_far_enough():
     assert log.views[0].camera.distortion is not None
 
 
+def test_of_several_lenses_the_strongest_decides():
+    log = log_through(lens=True)
+    weak = [
+        replace(frame, camera_index=1, camera=replace(frame.camera, distortion=0.1 * there(frame.camera.distortion)))
+        for frame in log.frames
+    ]
+    both = replace(log, frames=as_frames((*log.frames, *weak)), num_cameras=2)
+    alone, found = (LensSettings().detect(training_data(one)) for one in (log, both))
+    assert found.value == alone.value
+    assert found.reason.startswith("2 of 2 cameras")
+
+
 @pytest.mark.parametrize("least", [-1.0, math.nan])
 def test_a_least_shift_is_a_number(least):
     with pytest.raises(ValueError, match=r"min_shift must be pixels >= 0, got .*: to leave out lenses say when=off"):

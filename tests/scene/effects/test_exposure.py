@@ -8,7 +8,8 @@ import torch
 
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.scene.effects import Exposure, ExposureSettings, Sky, SkySettings, linearized
+from sparsestreet.scene.effects import Exposure, ExposureSettings, Finding, Sky, SkySettings, linearized
+from sparsestreet.scene.effects import exposure as exposure_module
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.rendering import RenderOptions, render
@@ -22,6 +23,7 @@ from tests.scene.street import background, camera_at, random_rows, training_data
 CAMERA = camera_at(-6.0, width=17, height=11)
 TIMES = {0: [0.0, 0.25, 1.0], 2: [0.1, 0.6]}
 SETTINGS = ExposureSettings(when="on")
+FOUND = Finding(called_for=True, reason="")
 
 
 def exposure(**said) -> Exposure:
@@ -182,6 +184,20 @@ def test_what_lies_in_the_boxes_of_the_log_says_nothing():
     assert "not measured" in SETTINGS.detect(of(log)).reason
 
 
+def test_boxes_of_held_out_frames_say_nothing():
+    """A tram before instant 4 and behind it; on the line between the two it would hide the wall at instant 4."""
+    poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    poses[:, 2, 3] = torch.tensor([-1000.0, 1000.0 + 2 * wall.DEPTH])
+    times = torch.tensor([3.5, 4.5], dtype=torch.float64) / (wall.INSTANTS - 1)
+    tram = Track("tram", "Tram", torch.tensor([4, 5]), poses, torch.tensor([60.0, 20.0, 1.0]), times=times)
+    log = log_of(wall.random_gains(0.1))
+    with_tram, without = (
+        SETTINGS.build(of(replace(log, tracks=tracks), frozenset({5})), FOUND, torch.Generator()).log_gains
+        for tracks in ((tram,), ())
+    )
+    assert torch.equal(with_tram, without)
+
+
 def test_it_starts_from_the_measured_gains_of_training_images_alone():
     planted = wall.random_gains(0.1)
     held_out = frozenset({3, 8})
@@ -214,6 +230,11 @@ def test_held_out_images_are_not_looked_at():
     sweeps = Sweeps(range(wall.INSTANTS), sweep)
     data = of(replace(log, frames=lazy, sweeps=sweeps), frozenset({5}))
     SETTINGS.build(data, SETTINGS.detect(data), torch.Generator())
+
+
+def test_times_increase_whatever_the_order_of_the_views():
+    seen = [View(CAMERA, time, frame, camera) for camera in (2, 0) for frame, time in ((0, 0.5), (1, 0.1), (2, 0.3))]
+    assert exposure_module._times(seen) == {0: [0.1, 0.3, 0.5], 2: [0.1, 0.3, 0.5]}
 
 
 def test_off_is_not_built():

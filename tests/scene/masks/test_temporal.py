@@ -249,6 +249,14 @@ def test_between_two_frames_a_row_shows_that_shows_at_either():
     assert (at[0.5] & ~at[0.25]).any()
 
 
+def test_before_the_first_of_eight_frames_the_last_one_does_not_show():
+    """Their bits fill a byte: none of it is padding."""
+    node = node_of(mask_of(where=scope([[0.2 + frame / 10 for frame in range(8)]])))
+    node.finish_mask()
+    node.rows.mask_bits.fill_(128)
+    assert [int(shown(node, time).sum()) for time in (0.0, 0.2, 0.9, 1.0)] == [0, 0, 40, 40]
+
+
 def test_bits_of_many_frames_and_of_none():
     """Eleven frames need two bytes a row; an empty table has none."""
     where = scope([[frame / 10 for frame in range(11)]])

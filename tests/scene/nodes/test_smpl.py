@@ -74,6 +74,13 @@ def test_one_flat_gaussian_lies_on_each_vertex():
     assert rows.sh_rest.shape == (2 * VERTICES, 3, 3)
 
 
+def test_a_pelvis_is_as_high_as_its_own_body_says():
+    people = (walker(height=1.2), walker("tall", height=1.9, y=3.0))
+    both = smpl(*people)
+    for instance, person in enumerate(people):
+        assert both.frame_height(instance) == pytest.approx(smpl(person).frame_height(0), rel=1e-5)
+
+
 def test_without_returns_a_person_is_gray():
     node = smpl_settings().build(data_of(walker(), returns=False), torch.Generator())
     torch.testing.assert_close(node.rows.sh_dc, torch.zeros(VERTICES, 1, 3))

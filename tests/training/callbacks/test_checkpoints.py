@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 
+from sparsestreet.ranks import LostProcessError
 from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
 from sparsestreet.training.callbacks.checkpoints import step_of
 from sparsestreet.training.callbacks.graceful_stop import TornStop
@@ -69,6 +70,14 @@ def test_an_exception_leaves_the_step_that_was_done_and_a_finished_run_takes_it_
     assert contents(folder) == {"last.ckpt": "5"}
 
 
+def test_one_before_a_moment_has_the_last_step_before_what_happens_after_it(tmp_path):
+    """At 60 % of 10 steps something happens in step 6: the checkpoint is of step 5, and stays."""
+    system = make_system({"background": background(1)})
+    trainer = HalfWritten(system, [Checkpoints(tmp_path, every=100, before=(0.6,))], max_steps=10)
+    trainer.walk(10)
+    assert contents(tmp_path) == {"before_0.6.ckpt": "5"}
+
+
 def test_a_half_written_one_of_a_killed_process_goes(tmp_path):
     for name in (".last.99999.tmp.ckpt", "last.ckpt", "mine.tmp.ckpt"):
         (tmp_path / name).write_text("half")
@@ -122,6 +131,17 @@ def test_a_full_disk_stops_no_training_but_is_an_error_at_the_end(tmp_path, capl
     with pytest.raises(OSError, match="no space left"):
         trainer.callbacks[0].on_train_end(trainer, trainer.system)
     assert contents(tmp_path) == {"last.ckpt": "2"}
+
+
+def test_a_lost_process_is_no_full_disk(tmp_path, monkeypatch):
+    trainer = trainer_in(tmp_path)
+
+    def lost(filepath: Path, **options: Any) -> None:
+        raise LostProcessError("another process does not answer")
+
+    monkeypatch.setattr(trainer, "save_checkpoint", lost)
+    with pytest.raises(LostProcessError):
+        trainer.walk(2)
 
 
 def test_the_newest_checkpoint_is_the_one_that_was_written_last(tmp_path):

@@ -74,6 +74,16 @@ def test_a_reset_is_followed_by_a_pause():
     assert [reason for step, _, reason in listener.reasons if step == 30] == ["densify", "cull", "opacity reset"]
 
 
+def test_a_pause_counts_images():
+    """Two a step: a reset after step 15, and 20 images later it is step 25."""
+    strategy = AskedStrategy()
+    control = DensityControl(Interval(0.0, 0.4, every=10), 0.4, Interval(0.1, 0.2, every=30), pause_after_reset=20)
+    trainer, system, _ = started(control, background=background(density=strategy))
+    system.course.images_per_step = 2
+    trainer.walk(100)
+    assert asked_at(strategy, "cull") == [5, 10, 15, 30, 35, 40]
+
+
 def test_the_strategy_is_told_radius_cap_and_the_callbacks_generator():
     strategy, control = AskedStrategy(), every_ten()
     node = background(density=strategy, max_gaussians=77)

@@ -9,13 +9,14 @@ from lightning import Callback, Trainer
 
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.phases import StageRecorder
+from sparsestreet.pruning import OpacityRule
 from sparsestreet.records.run import RUN
-from sparsestreet.training.callbacks import Pace, pace
+from sparsestreet.training.callbacks import Pace, Pruning, pace
 from sparsestreet.training.forecast import CLOSING_SECONDS
 from sparsestreet.training.run import train
 from sparsestreet.training.schedule import Course
 from sparsestreet.training.system import StreetSystem
-from tests.training.stubs import background, make_system
+from tests.training.stubs import StubTrainer, background, frame_at, make_system
 from tests.training.test_run import TRAINER, data, recipe
 
 BEFORE = 5.0
@@ -91,6 +92,20 @@ def test_without_a_budget_the_steps_are_those_of_the_schedule(tmp_path, clocked,
 @pytest.mark.lengthy
 def test_a_budget_that_is_over_takes_two_steps(tmp_path, clocked):
     assert trained(tmp_path, clocked, max_steps=12, minutes=0.01).run.steps == 2
+
+
+class Pruned(StageRecorder):
+    """Two passes of 3 s each."""
+
+    def seconds(self) -> dict[str, float]:
+        return {"train": 50.0, "prune/A at step 2": 3.0, "prune/A at step 5": 3.0}
+
+
+def test_the_pass_of_this_step_is_done():
+    pruning = Pruning([0.2, 0.5, 0.8], OpacityRule(keep=3))
+    trainer = StubTrainer(make_system({"background": background(4)}), [pruning], max_steps=10, train=(frame_at(),))
+    trainer.global_step = 5
+    assert Pace(Pruned())._passes(trainer, trainer.system) == pytest.approx(3.0)
 
 
 def test_a_trial_of_a_few_steps_is_not_forecast(tmp_path, clocked, monkeypatch, caplog):

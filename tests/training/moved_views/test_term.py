@@ -5,6 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sparsestreet.scene.effects import LensSettings
+from sparsestreet.scene.effects.lens import Pinhole
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, from_another_camera, render
@@ -49,6 +51,17 @@ def test_the_same_gaussians_from_elsewhere_are_those_of_a_view_there():
     assert torch.equal(again.rgb, anew.rgb)
     assert torch.equal(again.depth, anew.depth)
     assert not torch.equal(again.rgb, rendering.rgb)
+
+
+def test_another_camera_is_seen_through_the_effects():
+    """A lens that the scene leaves out is left out of both images."""
+    plain, frame = scene(), frame_at(0, WIDTH, HEIGHT)
+    without = SceneGraph(dict(plain.nodes.items()), {"lens": Pinhole(LensSettings(when="off"))})
+    bent = View(replace(frame.camera, distortion=torch.tensor([-0.3, 0.05, 0.0, 0.0, 0.0])), frame.time)
+    rendering = seen(plain, frame)
+    with_lens, left_out = (from_another_camera(one, rendering, bent, rendering.options) for one in (plain, without))
+    assert torch.equal(left_out.rgb, rendering.rgb)
+    assert not torch.equal(with_lens.rgb, rendering.rgb)
 
 
 @pytest.mark.parametrize("divisor", [1, 2])
