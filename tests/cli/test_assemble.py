@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.commands import evaluate as evaluate_module
 from sparsestreet.cli.commands.evaluate import evaluate
-from sparsestreet.cli.config.assemble import data_of, identity_of, logger_of, recipe_of, this_command, trainer_of
+from sparsestreet.cli.config.assemble import data_of, identity_of, logger_of, recipe_of, trainer_of
 from sparsestreet.cli.config.compose import resolved
 from sparsestreet.cli.runs import run as run_module
 from sparsestreet.cli.runs import run as step_module
@@ -111,10 +111,6 @@ def test_a_key_of_an_earlier_version_has_one_clear_error(log):
         data_of(as_a(DictConfig, old))
 
 
-def test_a_command_is_quoted():
-    assert this_command(["train", "out=a b"]) == "sparsestreet train 'out=a b'"
-
-
 @pytest.mark.parametrize(("resume", "summary"), [(None, make_summary(psnr=21.5)), ("some/run", None)])
 def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, resume, summary):
     words = [*WORDS, *([f"resume={resume}"] if resume else [])]
@@ -145,11 +141,6 @@ def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, 
     seconds = how["stages"].seconds()
     assert list(seconds) == ["start", "other", "data"]
     assert 3 <= seconds["start"] < 60
-
-
-def test_a_configuration_that_cannot_be_is_no_run(tmp_path):
-    with pytest.raises(ValueError, match=r"training runs on one device, got trainer\.devices=2"):
-        run(composed("trainer.devices=2"), tmp_path, 0.0)
 
 
 def test_a_bench_trains_without_what_a_run_leaves(log, monkeypatch, tmp_path):

@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.commands.data import data
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import CONF
 from sparsestreet.cli.config.log_from_options import found_option, with_found_data
@@ -59,24 +58,9 @@ def test_the_options_of_the_reader_that_is_found_apply(tmp_path):
     assert composed(*words).data == composed("data=kitti", f"data.root={tmp_path}", "seed=3").data
 
 
-def test_nothing_else_is_touched():
-    assert with_found_data(["data=kitti", "-m"]) == (["data=kitti", "-m"], None)
-
-
-def test_colmaps_cameras_are_no_other_calibration(tmp_path):
-    """A log of one's own keeps its calibration in cameras.json, beside the rig.json that was made of it."""
-    assert found_option(touch(tmp_path, "cameras.json", "rig.json", "cameras.yaml"))[0] == "rig_json"
-    assert found_option(touch(tmp_path / "b", "cameras.txt"))[0] == "colmap"
-
-
 def test_an_empty_folder_is_one_line(tmp_path):
     with pytest.raises(ValueError, match=rf"data.root={tmp_path} is an empty folder: name that of a log; [^\n]*$"):
         found_option(tmp_path)
-
-
-def test_a_folder_in_quotes(tmp_path):
-    odd = touch(tmp_path / "a, b=c", FILES["nuscenes"])
-    assert with_found_data(["data=auto", f"data.root='{odd}'"])[0][0] == "data=nuscenes"
 
 
 def test_a_folder_that_no_reader_knows_lists_what_each_missed(tmp_path):
@@ -134,15 +118,6 @@ def test_a_wrong_command_is_answered_before_anything_is_read(words, said, tmp_pa
     written = capsys.readouterr().err
     assert said in written
     assert written.startswith("sparsestreet train: ")
-
-
-def test_a_check_says_which_reader_it_asked_and_what_it_still_needs(tmp_path, capsys):
-    assert data(["check", str(make_nuscenes(tmp_path / "a")), "split.stride=0"]) == 0
-    assert capsys.readouterr().out.startswith("data=drivestudio, as ")
-    two = touch(tmp_path / "b", FILES["kitti"])
-    (two / "2011_09_26/2011_09_26_drive_0002_sync").mkdir()
-    assert data(["check", str(two)]) == 2
-    assert "name one (data.log.drive)" in capsys.readouterr().err
 
 
 def test_a_reader_that_cannot_be_imported_is_named(tmp_path):

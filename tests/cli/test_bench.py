@@ -12,30 +12,10 @@ from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.cli.commands import bench as cli_bench
 from sparsestreet.cli.commands.bench import bench, trained_street
 from sparsestreet.cli.runs import run as cli_step
-from sparsestreet.ops import splat
 from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views
-
-
-def test_help_teaches_by_example(capsys):
-    assert bench(["--help"]) == 0
-    text = capsys.readouterr().out
-    assert all(f"sparsestreet bench {mode}" in text for mode in ("settings", "blend", "step", "costs", "scaling"))
-
-
-def test_unknown_mode_is_refused(capsys):
-    for words, said in (
-        (["setting"], "mode must be one of settings, blend, step, costs, scaling, got 'setting'"),
-        (["--quick"], "'--quick' is no option: write key=value, with one of mode, quick, street, threads, out"),
-        (["blend", "sed=1"], "no key 'sed'; there are mode, quick, street, threads, out"),
-        (["blend", "street=RUN"], "street=RUN is for the modes settings and costs, got blend: leave it out"),
-        (["costs"], "name the folder of its run with street=RUN"),
-        (["blend", "threads=0"], "threads is at least 1, got 0"),
-    ):
-        assert bench(words) == 2
-        assert said in capsys.readouterr().err
 
 
 def test_records_name_command_and_threads(tmp_path, capsys):
@@ -65,32 +45,6 @@ def test_step_times_and_counts_the_phases_of_a_training(tmp_path, tiny_street, c
     assert record["gaussians"].keys() == {"background", "rigid"}
     assert (tmp_path / "step.png").stat().st_size > 10_000
     assert "times its op" in capsys.readouterr().out
-
-
-def test_step_refuses_what_train_refuses(tmp_path, capsys):
-    assert bench(["step", "quick=true", f"out={tmp_path}", "schedule.max_stps=3"]) == 2
-    assert "bench: no key 'schedule.max_stps'" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_is_no_run(tmp_path):
-    with pytest.raises(FileNotFoundError, match="there is no scene at"):
-        trained_street(tmp_path)
-
-
-@pytest.mark.slow
-def test_the_street_of_a_run_is_what_the_run_renders(run_train, tmp_path):
-    run = run_train(tmp_path / "run", "schedule.max_steps=20")
-    street = trained_street(run)
-    assert street.source.startswith("trained: run on ")
-    assert not street.gaussians.means.requires_grad
-    views = read_views(run / "views.json").all
-    view = views[len(views) // 2]
-    assert street.source.endswith(f"frame {view.frame_index}")
-    with torch.no_grad():
-        again = splat(street.gaussians, street.camera)
-    assert torch.equal(again.rgb, load_scene(run).render(view).splats.rgb)  # without the sky
-    assert float(again.alpha.mean()) > 0.2
 
 
 @pytest.fixture

@@ -95,11 +95,6 @@ def test_the_first_failure_ends_it(asked, monkeypatch):
     assert asked == []
 
 
-def test_help(asked, capsys):
-    assert demo(["--help"]) == 0
-    assert "sparsestreet demo [out=DIR] [key=value ...]" in capsys.readouterr().out
-
-
 @pytest.fixture
 def trained(monkeypatch):
     """Words of each training; each leaves a record (21, 22, 23 dB) and a picture in the folder that it was given."""
@@ -134,14 +129,6 @@ def test_the_demo_writes_where_it_is_told(name, trained, tmp_path, monkeypatch, 
     assert "21.00" in said
     assert "99.00" not in said
     assert str(tmp_path / name / "removal") in said
-
-
-def test_the_demo_has_a_folder_of_its_own(trained, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert demo([]) == 0
-    assert sorted(path.name for path in (tmp_path / "outputs/demo").iterdir()) == [
-        "none", "paper_short", "removal", "table.md"
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("word", ["sparsify=paper", "folder=x", "hydra.run.dir=x", "resume=x", "-m", "out="])

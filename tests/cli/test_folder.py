@@ -1,7 +1,6 @@
 """Whose folder a run writes into: nobody else's unless asked, and none for a start that fails."""
 
 import math
-import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -91,12 +90,6 @@ def test_a_drive_is_the_same_by_another_path(tmp_path, monkeypatch):
     assert "holds another run" in there(folder_problem(composed([words[0], "data.root=drives/2"]), Path("run")))
 
 
-def test_a_configuration_that_was_torn_is_another_run(tmp_path):
-    out = a_run(tmp_path / "run", steps=None)
-    (out / ".hydra/config.yaml").write_text('name: "str')
-    assert "holds another run" in there(folder_problem(composed(()), out))
-
-
 def contents(out: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in out.rglob("*")}
 
@@ -134,14 +127,6 @@ def test_a_run_without_a_checkpoint_is_said_at_once(tmp_path, capsys):
     (out / "checkpoints/last.ckpt").rename(out / "checkpoints/.last.99.tmp.ckpt")  # killed while it wrote the first
     assert train([f"resume={out}"]) == 2
     assert f"start it again with its own options and out={out}" in capsys.readouterr().err
-
-
-def test_what_is_no_run_is_no_obstacle(tmp_path):
-    (tmp_path / "notes.txt").touch()
-    (tmp_path / ".hydra").mkdir()  # of a start that failed
-    (tmp_path / "train.log").touch()
-    assert folder_problem(composed(()), tmp_path) is None
-    assert folder_problem(composed(()), tmp_path / "new/folder") is None
 
 
 def test_a_place_that_cannot_be_written_is_said_at_once(tmp_path, monkeypatch):
@@ -194,19 +179,6 @@ def test_a_job_of_a_sweep_replaces_itself_alone(tmp_path, capsys):
     assert "holds another run (streetgs, seed 0)" in capsys.readouterr().err
     assert contents(out) == before  # no failed.json either, which would take the record out of reports
     assert run_job(composed(["sparsify=paper", "overwrite=true"]), out, lambda: 26.0) == 26.0
-
-
-def test_two_runs_in_one_folder(tmp_path, capsys):
-    """The second is told at once, before it reads anything; what the first has written by then stays."""
-    out = tmp_path / "run"
-    with sole_writer(out):
-        with pytest.raises(SystemExit) as ended:
-            train([f"out={out}"])
-        assert ended.value.code == 1
-        assert (out / ".lock").exists()
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1
-    assert said[0].startswith(f"sparsestreet train: {out} is being written by process {os.getpid()} on ")
 
 
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, caplog):
@@ -272,14 +244,6 @@ def test_nothing_is_written_or_removed_through_a_link(name, tmp_path, capsys):
         evaluate(scene, options, data, out, device=torch.device("cpu"), command="", extra=ExtraMetrics())
     assert contents(victim) == before
     assert (out / "checkpoints/last.ckpt").is_file()
-
-
-@pytest.mark.usefixtures("within_hydra")
-def test_a_run_that_goes_on_keeps_its_files(tmp_path):
-    out = a_run(tmp_path / "run", steps=23)
-    take_folder(composed([f"resume={out}"]), out, goes_on=True)
-    assert (out / "checkpoints/last.ckpt").is_file()
-    assert RUN.read(out).steps == 23
 
 
 @pytest.mark.usefixtures("within_hydra")

@@ -12,14 +12,12 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.scene.effects import EffectPlan
-from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.types import BodyPoses, Track
 from tests.cli.configurations import composed
 from tests.scene.street import NUM_FRAMES, pose, street_log, track
-from tests.typed import as_a
 
 METHODS = ("3dgs", "deformgs", "pvg", "streetgs", "omnire")
 SMALL = (
@@ -138,19 +136,3 @@ def test_nothing_to_start_from_is_an_error_of_one_sentence(method: str):
     recipe = recipe_of(composed(f"method={method}", *SMALL, "node.background.num_points=0"))
     with pytest.raises(ValueError, match="has nothing to start from: none of num_points=0"):
         recipe.build(StreetData(log, stride=4, offset=2), EffectPlan(()))
-
-
-def test_two_people_in_one_box_keep_their_own_rows():
-    scene = system_on(LOGS["two people in one box"][0]).scene
-    people = scene.nodes["smpl"].instances()
-    assert people.names == ("one", "two")
-    assert len(set(people.counts().tolist())) == 1
-
-
-def test_a_turn_by_180_degrees_is_no_jump_of_the_center():
-    """Between two frames that face each other's back a car is where it would be without the turn."""
-    log = LOGS["a turn by 180 degrees"][0]
-    poses = as_a(Rigid, system_on(log, "streetgs").scene.nodes["rigid"]).pose_at(0.125)
-    torch.testing.assert_close(poses.translations[0], torch.tensor([9.0, 1.0, 0.75]))
-    assert poses.quaternions.isfinite().all()
-    assert bool(poses.present)

@@ -3,9 +3,7 @@
 import json
 import re
 import shutil
-import subprocess
-import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +13,7 @@ from hydra.utils import instantiate
 from PIL import Image
 
 from sparsestreet.cli.commands import scenes
-from sparsestreet.cli.commands.render import USAGE, RenderRequest, render
+from sparsestreet.cli.commands.render import render
 from sparsestreet.cli.config.compose import load_run_config
 from sparsestreet.export import rig, video
 from sparsestreet.export.layers import LAYERS, layer_values
@@ -76,34 +74,6 @@ def test_a_shifted_path_is_seen_from_beside(run, tmp_path):
     assert not np.array_equal(shown[1][:, :48], rendered(stored, rig[0]))
 
 
-def test_a_change_of_lane_ends_beside_the_path(run, tmp_path):
-    for out, words in (("lane", ["path=lane_change"]), ("beside", ["path=shifted"]), ("on", [])):
-        offset = ["offset=1.5"] if words else []
-        assert render([f"scene={run}", f"out={tmp_path / out}", "cameras=0", *words, *offset]) == 0
-    lane, beside, on = (pictures(tmp_path / name) for name in ("lane", "beside", "on"))
-    assert np.array_equal(lane[0], on[0])
-    assert np.array_equal(lane[-1], beside[-1])
-
-
-def test_a_smooth_small_video(run, tmp_path):
-    words = [f"scene={run / 'scene.safetensors'}", f"out={tmp_path / 'a.mp4'}", "cameras=0", "width=24", "fps=30"]
-    assert render([*words, "log_fps=10", "quality=9", "device=cpu"]) == 0
-    from tests.export.test_video import read_video
-
-    fps, frames = read_video(tmp_path / "a.mp4")
-    assert (fps, frames.shape) == (30.0, (13, 16, 24, 3))
-
-
-def test_the_logs_own_rate_is_taken_where_it_is_known(run, tmp_path, capsys):
-    views = read_views(run / "views.json")
-    write_views(tmp_path / "others.json", views.training, views.held_out, frame_rate=4.0)
-    words = [f"scene={run}", f"out={tmp_path / 'a'}", "cameras=0", f"views={tmp_path / 'others.json'}"]
-    assert render(words) == 0
-    said = capsys.readouterr().out
-    assert "not known" not in said
-    assert "5 frames of camera 0 at 4 a second (the log's speed, 4 of its frames a second)" in said
-
-
 def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
     """Five frames, 0.1 s apart: each is shown for 0.1 s, whatever the frames a second of the video."""
     from tests.export.test_video import read_video
@@ -123,44 +93,6 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("change", "status", "said"),
-    [
-        ({"widht": 5}, 2, "did you mean 'width'?"),
-        ({"offset": 1}, 2, "needs both: path=shifted offset=METERS"),
-        ({"path": "shifted"}, 2, "needs both: path=shifted offset=METERS"),
-        ({"path": "circle"}, 2, "or a .json, got 'circle'"),
-        ({"path": "a.json", "frames": "0:2"}, 2, "frames= chooses of the log's"),
-        ({"path": "a.json"}, 1, "there is no path at a.json"),
-        ({"layers": "rgb,radar"}, 2, "layers are rgb, depth, alpha, nodes, instances, seen, lidar, each once"),
-        ({"layers": "rgb,lidar"}, 1, "the layer lidar needs the log that the scene was trained on"),
-        ({"layers": "rgb,rgb"}, 2, "each once, got rgb, rgb"),
-        ({"fov": 180}, 2, "fov lies between 0 and 180 degrees"),
-        ({"height": 0}, 2, "height must be above 0"),
-        ({"fps": 0}, 2, "fps must be above 0, got 0"),
-        ({"quality": 11}, 2, "quality lies in 1 to 10, got 11"),
-        ({"fps": 1e5}, 2, "fps lies in 0.001 to 1000, got 100000"),
-        ({"log_fps": 1e-5}, 2, "log_fps lies in 0.001 to 1000, got 1e-05"),
-        ({"quality": "nan"}, 2, "quality must be a number, got 'nan'"),
-        ({"width": 6000}, 1, "at most 16,384 pixels a side, got 24,000 x 4,000: take a smaller width="),
-        ({"out": "drive.avi"}, 2, "ends in .mp4"),
-        ({"scene": "nowhere"}, 1, "there is no scene at nowhere"),
-        ({"views": "nowhere.json"}, 1, "there is no nowhere.json: training writes"),
-        ({"cameras": 7}, 1, "no camera 7 in frame 0, only [0, 1, 2, 3]"),
-        ({"frames": "9:"}, 1, "the path has 0 to 4"),
-        ({"device": "tpu"}, 1, "device must be cpu or cuda, got 'tpu'"),
-    ],
-)
-def test_a_slip_is_one_line_and_leaves_nothing(run, tmp_path, change, status, said, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = {"scene": run, "out": "drive.mp4"} | change
-    assert render([f"{key}={value}" for key, value in words.items()]) == status
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.strip().splitlines()) == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
-
-
-@pytest.mark.parametrize(
     "error",
     [None, MemoryError(), RuntimeError("CUDA out of memory.\nTried to"), torch.OutOfMemoryError("out of memory")],
 )
@@ -176,27 +108,6 @@ def test_where_memory_does_not_do_it_is_one_line(run, tmp_path, error, capsys, m
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert ("more than the 5 that may be held" if error is None else "render: memory is out") in said
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_an_error_of_our_own_keeps_its_trace(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "side_by_side", lambda images: {}["of our own"])
-    with pytest.raises(KeyError, match="of our own"):
-        render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"])
-
-
-def test_without_a_file_the_usage_is_said(run, capsys):
-    assert render([str(run)]) == 2
-    assert "out=... is missing: sparsestreet render RUN FILE [key=value ...]" in capsys.readouterr().err
-
-
-def test_another_ending_is_refused_before_torch_is_there(run, tmp_path):
-    code = "import sys; from sparsestreet.cli.commands.render import render; status = render(sys.argv[1:])"
-    code += "; sys.exit(99 if 'torch' in sys.modules else status)"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(run), str(tmp_path / "out.avi")], capture_output=True, text=True
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "a video ends in .mp4, a folder of PNGs has no ending, got 'out.avi'" in done.stderr
 
 
 @pytest.mark.lengthy
@@ -235,11 +146,6 @@ def test_ctrl_c_leaves_nothing(run, tmp_path, monkeypatch, capsys):
     assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 130
     assert "stopped, nothing was written" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
-
-
-def test_the_help_names_every_option():
-    for field in fields(RenderRequest):
-        assert f"\n  {field.name} " in USAGE
 
 
 @pytest.mark.parametrize(
@@ -290,15 +196,6 @@ def test_a_path_of_poses_of_ones_own(run, tmp_path, capsys):
     assert f"3 frames of {tmp_path / 'poses.json'} at 10 a second, made" in capsys.readouterr().out
 
 
-def test_nerfstudios_frame_rate_is_that_of_the_video(run, tmp_path, capsys):
-    entry = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 60}
-    path = tmp_path / "camera_path.json"
-    path.write_text(json.dumps({"camera_path": [entry] * 4, "render_width": 32, "render_height": 24, "fps": 8}))
-    assert render([f"{run}", f"{tmp_path / 'a'}", f"path={path}"]) == 0
-    assert "at 8 a second" in capsys.readouterr().out
-    assert pictures(tmp_path / "a")[0].shape == (24, 32, 3)
-
-
 def test_another_rig(run, tmp_path):
     words = ["cameras=0", "frames=0:1", "up=1.0", "fov=100", "width=60", "height=30"]
     assert render([f"{run}", f"{tmp_path / 'a'}", *words]) == 0
@@ -337,11 +234,3 @@ def test_seen_images_are_training_images_and_counted_before_edits(run, tmp_path)
     assert np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])
     count_images(bare, views.all)
     assert not np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])
-
-
-def test_a_video_of_layers(run, tmp_path):
-    from tests.export.test_video import read_video
-
-    assert render([f"{run}", f"{tmp_path / 'a.mp4'}", "layers=[rgb,depth]", "cameras=0"]) == 0
-    _, frames = read_video(tmp_path / "a.mp4")
-    assert frames.shape == (5, 64, 48, 3)

@@ -11,7 +11,7 @@ from sparsestreet.cli.commands.jobs import jobs as jobs_command
 from sparsestreet.cli.commands.report import sweep_name
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import CONF
-from sparsestreet.cli.config.validate import config_problem, override_problem
+from sparsestreet.cli.config.validate import config_problem
 from sparsestreet.cli.runs import sweep
 from sparsestreet.cli.runs.sweep import (
     OF_DRIVES,
@@ -131,28 +131,10 @@ def test_global_pruning_of_table_3_is_global():
     assert background.callback.pruning.at == everywhere.callback.pruning.at == [0.93334]
 
 
-@pytest.mark.parametrize("name", ["drives", "streets", "tiny"])
-def test_what_a_control_counts_is_many_jobs_ahead(name):
-    """Hydra's sweeper changes the first option last: with sparsify first, all runs that are counted come first."""
-    params = composed(f"+sweep={name}").hydra.sweeper.params
-    first, *_ = params
-    options = params[first].split(",")
-    assert first == "sparsify"
-    assert options.index("removal") < min(options.index(one) for one in ("random", "capped") if one in options)
-
-
 def test_the_second_half_of_a_table_is_reported_as_the_table(tmp_path):
     for name in ("table1_waymo", "table1_waymo_paper", "table1_waymo_others"):
         (tmp_path / "multirun.yaml").write_text(f"hydra: {{runtime: {{choices: {{sweep: {name}}}}}}}")
         assert sweep_name(tmp_path) == "table1_waymo"
-
-
-def test_drives_are_read_where_the_authors_read_them():
-    windows = {}
-    for drive in ("172", "023", "788"):
-        log = composed("+sweep=table5_ablation", f"data.root=/drives/{drive}").data.log
-        windows[drive] = (log.first_frame, log.last_frame)
-    assert windows == {"172": (30, 180), "023": (0, 150), "788": (130, -1)}
 
 
 def test_a_control_keeps_what_the_other_run_ended_with(counted):
@@ -184,12 +166,6 @@ def test_a_shown_sweep_says_what_its_jobs_differ_in():
         "(conf/sweep/rules.yaml)"
     )
     assert note_of_sweep(["+sweep=rules"]) is note_of_sweep(["--cfg", "job"]) is None
-
-
-def test_launchers_compose_or_say_how_they_are_installed():
-    assert override_problem(["-m", "+sweep=tiny", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]) is None
-    assert override_problem(["-m", "+sweep=tiny", "hydra/launcher=submitit_slurm"]) is None
-    assert "pip install hydra-ray-launcher" in there(override_problem(["hydra/launcher=ray"]))
 
 
 @pytest.mark.parametrize(

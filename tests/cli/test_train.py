@@ -5,17 +5,17 @@ import json
 import shutil
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
+from PIL import Image
 
 from sparsestreet import load_scene
 from sparsestreet.cli.commands.evaluate import evaluate
-from sparsestreet.evaluation.speed import Timing
 from sparsestreet.metrics.definitions import PROTOCOLS
 from sparsestreet.metrics.lpips import ALEX, FOLDER_VARIABLE
 from sparsestreet.records.costs import COSTS
@@ -25,7 +25,6 @@ from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import read_views
-from tests.cli.conftest import TIMED_BY_DEFAULT
 from tests.cli.recompute import recompute
 from tests.conftest import checked, unchecked
 from tests.metrics.networks import random_weights, write_weights
@@ -34,16 +33,6 @@ from tests.typed import as_a, there
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
     return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
-
-
-@pytest.fixture(scope="module")
-def brief(run_train, tmp_path_factory) -> tuple[Path, float]:
-    """A run of two steps that measures more than usual, as often as by default; the seconds of its command."""
-    measured = ["evaluation.novel=[1.5]", "evaluation.presets=[fast]", *TIMED_BY_DEFAULT]
-    with unchecked():
-        started = time.perf_counter()
-        out = run_train(tmp_path_factory.mktemp("brief") / "run", "schedule.max_steps=2", *measured)
-        return out, time.perf_counter() - started
 
 
 @pytest.fixture(scope="module")
@@ -59,13 +48,18 @@ def evaluated_again(finished, tmp_path_factory) -> Path:
     return out
 
 
-def test_training_improves_and_leaves_records(finished, brief):
+def flat_psnr(root: Path) -> float:
+    """Of held-out images against their mean color."""
+    images = [np.asarray(Image.open(path)) / 255 for path in sorted((root / "images").glob("005_*.jpg"))]
+    return float(np.mean([-10 * np.log10(((image - image.mean((0, 1))) ** 2).mean()) for image in images]))
+
+
+def test_training_improves_and_leaves_records(finished, tiny_street):
     summary = json.loads((finished / "records" / "summary.json").read_text())
     with (finished / "curves" / "metrics.csv").open() as file:
         psnr = [float(row["psnr"]) for row in csv.DictReader(file) if row["psnr"]]
-    start = SUMMARY.read(brief[0])
-    # 60 steps from gray random rotations: several dB; noise between runs is zero on the CPU.
-    first = start.quality["held_out"]["psnr_full"].mean
+    (root,) = (Path(word.partition("=")[2]) for word in tiny_street if word.startswith("data.log.root="))
+    first = flat_psnr(root)
     assert summary["quality"]["held_out"]["psnr_full"]["mean"] > first + 3
     assert summary["quality"]["training"]["psnr_full"]["mean"] > first + 3
     assert psnr
@@ -87,15 +81,6 @@ def test_training_ends_with_its_result(finished):
     assert places.endswith(
         f"pictures: {finished}/pictures/sheet.png; curves: {finished}/curves; numbers: {finished}/records"
     )
-
-
-def test_phases_are_the_wall_clock_of_the_command(brief):
-    """By a clock outside: each second belongs to one phase."""
-    out, wall = brief
-    costs = COSTS.read(out)
-    assert costs.wall_seconds == pytest.approx(wall, rel=0.02)
-    assert sum(costs.phases.values()) == pytest.approx(wall, rel=0.02)
-    assert costs.phases["other"] < 0.02 * wall
 
 
 def test_costs_of_a_run(finished):
@@ -154,7 +139,6 @@ def test_run_json_says_what_the_run_is(finished, tiny_street):
     assert run == SUMMARY.read(finished).run
 
 
-@pytest.mark.slow
 def test_held_out_views_are_those_of_the_split(finished, run_train, tmp_path):
     views = read_views(finished / "views.json")
     assert {view.frame_index for view in views.held_out} == {5}
@@ -170,6 +154,7 @@ def test_held_out_views_are_those_of_the_split(finished, run_train, tmp_path):
     assert not {round(float(time) * 11) for time in times} & {3, 7, 11}
 
 
+@pytest.mark.slow
 def test_the_scene_opens_by_itself_in_another_place(finished, tmp_path):
     """Moved, without the log, in a new process: the picture of the run, bit for bit."""
     folder = tmp_path / "elsewhere"
@@ -189,14 +174,6 @@ def test_the_scene_opens_by_itself_in_another_place(finished, tmp_path):
     subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, timeout=120)
     expected = finished / "pictures" / "005_0_render.png"
     assert (folder / "render.png").read_bytes() == expected.read_bytes()
-
-
-def test_instances_keep_the_names_of_their_tracks(finished, tiny_street):
-    root = Path(next(text for text in tiny_street if text.startswith("data.log.root=")).partition("=")[2])
-    tracks = json.loads((root / "instances" / "instances_info.json").read_text())
-    names = load_scene(finished).scene.nodes["rigid"].instances().names
-    assert names
-    assert set(names) <= set(tracks)
 
 
 def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished, evaluated_again):
@@ -228,7 +205,6 @@ def test_the_tables_numbers_follow_from_predictions_and_images(finished, evaluat
     assert len(stored) == SUMMARY.read(evaluated_again).images["held_out"]
 
 
-@pytest.mark.slow
 def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monkeypatch):
     """The street knows the truth beside the path; the networks' weights are random ones."""
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
@@ -269,7 +245,6 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, 
     assert "is of an earlier version, its configuration lacks 'evaluation': train it again" in capsys.readouterr().err
 
 
-@pytest.mark.slow
 def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
     with unchecked():
         out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=1")
@@ -281,18 +256,6 @@ def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_p
         assert evaluate([f"run={out}"]) == 0
 
 
-def test_training_measures_what_its_configuration_asks_for(brief, finished):
-    out, _ = brief
-    assert SUMMARY.read(out).latency.clocks["frame"].repeats == Timing().repeats
-    assert SUMMARY.read(finished).latency.clocks["frame"].repeats == 2  # that of all other runs here
-    trained = NOVEL.read(out)
-    assert [(one.offset, one.views) for one in trained.shifts] == [(1.5, 2), (-1.5, 2)]
-    assert trained.command.startswith("sparsestreet train ")
-    assert [one.preset for one in PRESETS.read(out).rendered] == ["fast"]
-    assert {"novel", "presets"} < COSTS.read(out).phases.keys()
-
-
-@pytest.mark.slow
 def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
     """With whole numbers among the coefficients, as one types them; and what else the log's notes have to say."""
     street = [
@@ -309,12 +272,6 @@ def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
     assert "no lidar: Gaussians start from points in images" in said
 
 
-@pytest.mark.slow
-def test_adam_of_visible_gaussians_runs(run_train, tmp_path):
-    run_train(tmp_path, "optimizer.visible_only=true", "trainer.fast_dev_run=2")
-
-
-@pytest.mark.slow
 def test_bf16_mixed_changes_nothing_where_it_would_hurt(run_train, tmp_path):
     """Masks, losses and the op stay float32: in bfloat16 a logit would stop at -4.0, above the threshold."""
     few = ("sparsify=masks", "schedule.max_steps=12", "schedule.mask_in.stop=1.0", "schedule.mask_in.every=100")
@@ -325,7 +282,6 @@ def test_bf16_mixed_changes_nothing_where_it_would_hurt(run_train, tmp_path):
         assert torch.equal(value, mixed["state_dict"][name]), name
 
 
-@pytest.mark.slow
 def test_the_floor_holds_while_masks_are_trained(run_train, tmp_path):
     """A crushing lambda closes every mask; K_min Gaussians stay open, are kept, and the firing is logged."""
     out = run_train(
@@ -348,7 +304,6 @@ def test_masks_end_with_their_stage(finished):
     assert not [name for name in weights(finished) if "mask" in name]
 
 
-@pytest.mark.slow
 def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
     out = run_train(tmp_path, "node.background.max_gaussians=2300", "node.background.density.grad_threshold=1e-6")
     assert RUN.read(out).caps["background"] == 2300
