@@ -9,16 +9,14 @@ import pytest
 import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning import Callback
-from lightning.pytorch.loggers import CSVLogger
 from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.commands import evaluate as evaluate_module
 from sparsestreet.cli.commands.evaluate import evaluate
-from sparsestreet.cli.config.assemble import data_of, identity_of, logger_of, recipe_of, trainer_of
 from sparsestreet.cli.config.compose import resolved
 from sparsestreet.cli.runs import run as run_module
 from sparsestreet.cli.runs import run as step_module
-from sparsestreet.cli.runs.run import NEVER, run, train_with
+from sparsestreet.cli.runs.run import NEVER, data_of, identity_of, recipe_of, run, train_with
 from sparsestreet.data.synthetic.reader import StreetReader
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
@@ -92,14 +90,6 @@ def test_a_run_is_called_what_its_configuration_says(log):
     assert (identity.label, identity.method, identity.sparsify) == ("mine", "3dgs", "removal")
     assert (identity.data_hash, identity.command) == ("c0ffee", "typed")
     assert identity.config == flat_config(resolved(cfg))
-
-
-def test_a_trainer_and_a_logger(tmp_path):
-    given = trainer_of(composed(*WORDS), [3]).keywords
-    assert (given["log_every_n_steps"], given["devices"]) == (4, [3])
-    assert logger_of(composed("logger=none")) is False
-    cfg = as_a(DictConfig, OmegaConf.merge(composed(), {"folder": str(tmp_path)}))
-    assert Path(as_a(CSVLogger, logger_of(cfg)).log_dir) == tmp_path / "curves"
 
 
 def test_a_key_of_an_earlier_version_has_one_clear_error(log):

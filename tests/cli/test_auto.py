@@ -9,7 +9,6 @@ from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import CONF
 from sparsestreet.cli.config.log_from_options import found_option, with_found_data
 from tests.cli.configurations import composed
-from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 
 OPTIONS = {path.stem for path in (CONF / "data").glob("*.yaml") if "root" in set(OmegaConf.load(path))}
 FILES = {
@@ -44,11 +43,6 @@ def test_a_folder_is_known_by_a_file(name, tmp_path):
     found, why = found_option(touch(tmp_path, FILES[name]))
     assert found == name
     assert (tmp_path / FILES[name]).is_relative_to(why)
-
-
-@pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
-def test_drivestudios_layout_is_known_whoever_recorded_it(make, tmp_path):
-    assert found_option(make(tmp_path))[0] == "drivestudio"
 
 
 def test_the_options_of_the_reader_that_is_found_apply(tmp_path):
@@ -118,12 +112,3 @@ def test_a_wrong_command_is_answered_before_anything_is_read(words, said, tmp_pa
     written = capsys.readouterr().err
     assert said in written
     assert written.startswith("sparsestreet train: ")
-
-
-def test_a_reader_that_cannot_be_imported_is_named(tmp_path):
-    conf = tmp_path / "conf/data"
-    conf.mkdir(parents=True)
-    (conf / "mine.yaml").write_text("root: ???\nlog: {_target_: nobody.has.Reader}\n")
-    words = [f"hydra.searchpath=[file://{conf.parent}]", "data=auto", f"data.root={tmp_path}"]
-    with pytest.raises(ValueError, match=r"data=mine names nobody\.has\.Reader, which cannot be imported"):
-        with_found_data(words)

@@ -12,7 +12,6 @@ from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.cli.commands import bench as cli_bench
 from sparsestreet.cli.commands.bench import bench, trained_street
 from sparsestreet.cli.runs import run as cli_step
-from sparsestreet.records.provenance import this_machine, this_source
 from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views
@@ -24,27 +23,6 @@ def test_records_name_command_and_threads(tmp_path, capsys):
     assert first["provenance"]["command"].startswith("sparsestreet bench scaling quick=true")
     assert first["provenance"]["threads"] == torch.get_num_threads()
     assert first["rows"] < min(scaling.ROWS)
-
-
-@pytest.mark.slow
-def test_step_times_and_counts_the_phases_of_a_training(tmp_path, tiny_street, capsys):
-    assert (
-        bench(["step", "quick=true", f"out={tmp_path}", *tiny_street, "sparsify=masks", "callback.phase_times.every=1"])
-        == 0
-    )
-    record = json.loads((tmp_path / "step.jsonl").read_text())
-    phases = {phase["name"]: phase for phase in record["phases"]}
-    every_step = {"data", "scene", "splat", "sky", "loss photometric", "loss mask_sparsity", "splat backward",
-                  "scene backward", "backward", "optimizer", "density statistics", "loop"}  # fmt: skip
-    assert every_step <= phases.keys()
-    assert sum(phase["time"]["median"] for phase in phases.values()) == pytest.approx(
-        record["step"]["median"], rel=0.5
-    )  # medians of parts beside the median of the whole
-    assert sum(phase["operations"] for phase in phases.values()) == pytest.approx(record["operations"])
-    assert phases["splat"]["floor_ms"] > 0
-    assert record["gaussians"].keys() == {"background", "rigid"}
-    assert (tmp_path / "step.png").stat().st_size > 10_000
-    assert "times its op" in capsys.readouterr().out
 
 
 @pytest.fixture
@@ -108,20 +86,6 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
     if mode == "step":
         ((overrides, _),) = trained
         assert overrides == ["seed=3"]
-
-
-def test_threads_and_words_stand_in_the_record(handed, monkeypatch, tmp_path):
-    before = torch.get_num_threads()
-    numbers = []
-    monkeypatch.setattr(torch, "set_num_threads", numbers.append)
-    bench(["blend", f"threads={before + 1}", f"out={tmp_path / 'a b'}"])
-    assert numbers == [before + 1]
-    provenance = handed["run_blend"][0][4]._provenance
-    assert provenance.command == f"sparsestreet bench blend threads={before + 1} 'out={tmp_path / 'a b'}'"
-    assert (provenance.threads, provenance.machine, provenance.source) == (before, this_machine(), this_source())
-    numbers.clear()
-    bench(["blend", f"out={tmp_path}"])
-    assert numbers == []
 
 
 def test_the_street_of_a_run_is_the_view_in_its_middle(tmp_path):

@@ -2,27 +2,25 @@
 
 import csv
 import itertools
-from functools import cache
 from typing import Any
 
 import pytest
 import torch
 from hydra.errors import InstantiationException
+from hydra.utils import instantiate
 
-from sparsestreet.cli.config.assemble import recipe_of
-from sparsestreet.cli.config.compose import resolved
-from sparsestreet.cli.config.option_files import option_tree, options_of
+from sparsestreet.cli.config.compose import option_tree, options_of, resolved
 from sparsestreet.cli.config.validate import config_problem, override_problem
+from sparsestreet.cli.runs.run import recipe_of
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.records.configuration import flat_config
-from sparsestreet.scene.density import GradientDensity, VibratingDensity
-from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.sources import ImagePoints
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import SampledMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.training.losses import MaskSparsity
+from sparsestreet.training.parallel import DataParallel
 from tests.cli.configurations import composed
 from tests.typed import as_a, there
 
@@ -37,11 +35,6 @@ paper takes part in test_toy_node.py."""
 EXPERIMENTS = options_of("experiment")
 
 
-@cache
-def plain_losses(method: str) -> list[str]:
-    return list(recipe_of(composed(f"method={method}")).losses)
-
-
 @pytest.mark.parametrize(
     ("method", "sparsify"),
     [pair if pair in COMPOSED else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
@@ -52,7 +45,10 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     recipe = recipe_of(cfg)
     masked = cfg.sparsify.masks
     assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
-    assert list(recipe.losses) == [*plain_losses(method), *(["mask_sparsity"] if masked else [])]
+    assert list(recipe.losses) == [
+        *recipe_of(composed(f"method={method}")).losses,
+        *(["mask_sparsity"] if masked else []),
+    ]
     # Which rule and which masks a sparsification has is the paper's matter, and that of its name.
     rules = dict.fromkeys(("importance", "paper", "paper_short"), ImportanceRule)
     rules |= {"removal": LeaveOneOutRule, "random": RandomRule, "opacity": OpacityRule}
@@ -134,13 +130,6 @@ def test_the_short_variant_is_the_schedules():
     assert short == exact
 
 
-def test_the_shares_of_the_sources_are_all_points():
-    """Whatever the images show: what one source is not asked for, another is."""
-    sources = as_a(BackgroundSettings, recipe_of(composed()).nodes["background"]).sources.values()
-    for seen in (Coverage(0.5, 0.3), Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0)):
-        assert sum(source.share(seen) for source in sources) == pytest.approx(1)
-
-
 def test_sources_are_chosen_left_out_and_refused():
     chosen = recipe_of(composed("source@node.background.sources=[lidar,far]")).nodes["background"]
     assert list(as_a(BackgroundSettings, chosen).sources) == ["lidar", "far"]
@@ -150,17 +139,6 @@ def test_sources_are_chosen_left_out_and_refused():
     assert as_a(ImagePoints, sources["images"]).order == "random"
     with pytest.raises(InstantiationException, match=r"leave one out with ~node\.background\.sources\.far"):
         recipe_of(composed("node.background.sources.far=null"))
-
-
-def test_a_density_strategy_is_a_choice():
-    """A node says what differs, whichever it is; the strategy of PVG has the period of the node it is chosen for."""
-    vibrating = recipe_of(composed("method=pvg", "node.background.cycle=0.3")).nodes["background"].density
-    pvg = as_a(VibratingDensity, vibrating)
-    assert (pvg.cycle, pvg.cull_scale) == (0.3, 0.5)
-    other = recipe_of(composed("method=pvg", "density@node.background.density=gradient")).nodes["background"].density
-    assert other == GradientDensity()
-    cars = as_a(GradientDensity, recipe_of(composed()).nodes["rigid"].density)
-    assert (cars.cull_scale, cars.split_scale) == (0.1, 0.003)
 
 
 @pytest.mark.parametrize(
@@ -283,13 +261,7 @@ def test_the_terms_of_the_baselines_are_options():
     assert not losses["depth"].inverse
 
 
-@pytest.mark.slow
-def test_the_terms_of_the_baselines_train_and_a_control_prunes_every_node(run_train, tmp_path):
-    """All terms in one run, the dynamic region in its last third, and pruning to given numbers."""
-    counts = "callback.pruning.rule.keep={background: 500, rigid: 0.5}"
-    out = run_train(tmp_path, *BASELINE_TERMS, "sparsify=random", counts, "trainer.fast_dev_run=6")
-    with (out / "records" / "counts.csv").open() as file:
-        pruned = {row["node"]: row for row in csv.DictReader(file) if row["reason"] == "pruning"}
-    assert pruned["background"]["after"] == "500"
-    # Objects have floors of their own.
-    assert 0.5 * int(pruned["rigid"]["before"]) <= int(pruned["rigid"]["after"]) < int(pruned["rigid"]["before"])
+def test_several_processes_are_an_option():
+    cfg = composed("trainer=ddp", "trainer.devices=2")
+    assert type(instantiate(cfg.trainer.strategy)) is DataParallel
+    assert (cfg.trainer.devices, cfg.trainer.accelerator, cfg.optimizer.batch_rule) == (2, "auto", "sqrt")

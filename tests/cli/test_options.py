@@ -42,12 +42,6 @@ def test_every_kind_of_value_is_read():
     assert parse_options(words, Wishes) == expected
 
 
-def test_brackets_may_be_left_out_and_ranges_are_open():
-    assert parse_options(["scene=r", "cameras=0, 2", "frames=:5"], Wishes).cameras == (0, 2)
-    assert parse_options(["scene=r", "frames=5:"], Wishes).frames == slice(5, None)
-    assert parse_options(["scene=~/r"], Wishes).scene == Path.home() / "r"
-
-
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -97,12 +91,6 @@ def test_a_few_fields_take_a_word_each(words, tmp_path, monkeypatch):
     assert parse_options(words, Wishes, positional=("scene", "title")) == Wishes(Path("a=b/run"), title="two words")
 
 
-@pytest.mark.parametrize("words", [["r", "t", "more"], ["r", "scene=q", "t"], ["r", "--width=5"]])
-def test_a_word_too_many_is_no_option(words):
-    with pytest.raises(OptionError, match="is no option: write key=value, with one of scene, width"):
-        parse_options(words, Wishes, positional=("scene", "title"))
-
-
 def _fail(error: BaseException):
     def act(wishes: Wishes) -> None:
         raise error
@@ -128,10 +116,3 @@ def test_what_an_action_meets_is_one_line_and_a_status(error, status, said, caps
 def test_usage_is_shown_without_acting(words, status, capsys):
     assert run_command("film", "USAGE", words, Wishes, _fail(TypeError("acted"))) == status
     assert capsys.readouterr().out == "USAGE\n"
-
-
-def test_what_is_missing_comes_with_the_form_of_the_command(capsys):
-    usage = "sparsestreet shows RUN FILE [key=value ...]     what was seen\n\n  scene   a run"
-    assert run_command("shows", usage, ["width=5"], Wishes, print) == 2
-    said = "sparsestreet shows: scene=... is missing: sparsestreet shows RUN FILE [key=value ...]\n"
-    assert capsys.readouterr().err == said

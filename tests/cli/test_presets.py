@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from sparsestreet.cli.commands.presets import SAID, WIDTH, lines, overview, pairs, presets, rows_of
-from sparsestreet.cli.config.assemble import recipe_of
 from sparsestreet.cli.config.compose import CONF, resolved
 from sparsestreet.cli.config.validate import config_problem, preset_notes
+from sparsestreet.cli.runs.run import recipe_of
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.training.callbacks import DensityControl
 from sparsestreet.training.schedule import Course, Interval
@@ -256,18 +256,6 @@ def test_resets_come_at_the_steps_of_upstream():
     resets = [step for step in range(30_001) if interval.due(step, Course(30_000))]
     assert resets == [3_100, 6_100, 9_100, 12_100, 15_100, 18_100, 21_100, 24_100, 27_100]
     assert not any(interval.due(step, Course(2_000)) for step in range(2_001))
-
-
-def test_what_is_lacking_is_said_in_plain_words():
-    cfg = composed("preset=drivestudio_legacy", "method=omnire", *FULL)
-    (note,) = preset_notes(cfg)
-    assert note.startswith("preset drivestudio_legacy lacks of DriveStudio: ")
-    assert "skinned" in note
-    assert "camera poses" not in note  # upstream's legacy has none
-    assert "camera poses are not refined" in next(preset_notes(composed("preset=drivestudio", "method=pvg", *FULL)))
-    assert list(preset_notes(composed())) == []
-    # The configuration of a run has it.
-    assert any(key.startswith("preset.absent.") for key in flat("drivestudio", "pvg"))
 
 
 @pytest.mark.slow

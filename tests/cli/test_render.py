@@ -1,6 +1,5 @@
 """``sparsestreet render`` on a hand-made scene; the run of a real training is rendered in test_train."""
 
-import json
 import re
 import shutil
 from dataclasses import replace
@@ -12,18 +11,13 @@ import torch
 from hydra.utils import instantiate
 from PIL import Image
 
-from sparsestreet.cli.commands import scenes
 from sparsestreet.cli.commands.render import render
 from sparsestreet.cli.config.compose import load_run_config
-from sparsestreet.export import rig, video
-from sparsestreet.export.layers import LAYERS, layer_values
-from sparsestreet.export.path import recorded, resized, shifted
-from sparsestreet.export.seen import count_images
-from sparsestreet.geometry.cameras import inverse
+from sparsestreet.export import video
+from sparsestreet.export.path import shifted
 from sparsestreet.ops.cpu import rasterizer
-from sparsestreet.scene.edits import REMOVED, Edits, edited
 from sparsestreet.scene.storage import save_scene
-from sparsestreet.scene.views import read_views, write_views
+from sparsestreet.scene.views import write_views
 from tests.export.street import stored_street, street_views
 from tests.typed import there
 
@@ -131,13 +125,6 @@ def test_the_lidar_of_another_log_is_refused(finished, tmp_path, capsys):
     assert "the log is not the one that" in capsys.readouterr().err
 
 
-def test_a_place_that_cannot_be_written_is_found_before_the_first_frame(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(video, "side_by_side", lambda images: pytest.fail("a frame was rendered"))
-    (tmp_path / "file").write_text("")
-    assert render([f"scene={run}", f"out={tmp_path / 'file' / 'drive.mp4'}"]) == 1
-    assert "cannot be written" in capsys.readouterr().err
-
-
 def test_ctrl_c_leaves_nothing(run, tmp_path, monkeypatch, capsys):
     def interrupt(images):
         raise KeyboardInterrupt
@@ -146,91 +133,3 @@ def test_ctrl_c_leaves_nothing(run, tmp_path, monkeypatch, capsys):
     assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 130
     assert "stopped, nothing was written" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ([], {"fps": 4.0, "quality": 7.0, "device": None, "count": 5, "size": (48, 32)}),
-        (["quality=2.5", "fps=8", "device=cpu", "width=24", "frames=1:4"],
-         {"fps": 8.0, "quality": 2.5, "device": "cpu", "count": 5, "size": (24, 16)}),
-        (["log_fps=2", "fps=1"], {"fps": 1.0, "quality": 7.0, "device": None, "count": 3, "size": (48, 32)}),
-    ],
-)  # fmt: skip
-def test_everything_that_is_asked_for_arrives(run, tmp_path, monkeypatch, capsys, words, expected):
-    """Five frames at 4 a second; a video of 8 a second of three of them has five, one of half the speed three."""
-    views = read_views(run / "views.json")
-    write_views(run / "views.json", views.training, views.held_out, frame_rate=4.0)
-    opened, given = [], {}
-    stored = stored_street()
-    monkeypatch.setattr(scenes, "open_scene", lambda *place: opened.append(place) or stored)
-    monkeypatch.setattr(video, "path_pictures", lambda *told: given.update(path=told) or iter(()))
-    monkeypatch.setattr(video, "write_pictures", lambda *told, **how: given.update(written=(told, how)) or 77)
-    assert render([f"scene={run}", f"out={tmp_path / 'o'}", "cameras=[2,0]", *words]) == 0
-    assert opened == [(run, expected["device"], ())]
-    shown, path = given["path"]
-    assert shown is stored
-    assert len(path) == expected["count"]
-    assert {(view.camera.width, view.camera.height) for rig in path for view in rig} == {expected["size"]}
-    assert {tuple(view.camera_index for view in rig) for rig in path} == {(2, 0)}
-    (out, _), how = given["written"]
-    assert out == tmp_path / "o"
-    assert how == {"fps": expected["fps"], "quality": expected["quality"]}
-    assert f"{tmp_path / 'o'}: 77 frames of camera 2, 0 at {expected['fps']:g} a second" in capsys.readouterr().out
-
-
-def test_a_path_of_poses_of_ones_own(run, tmp_path, capsys):
-    views = read_views(run / "views.json").all
-    front = [view for view in views if view.camera_index == 0]
-    poses = [
-        {"seconds": 0.1 * view.indices[0], "world_from_camera": inverse(view.camera.camera_from_world).tolist()}
-        for view in front[:3]
-    ]
-    (tmp_path / "poses.json").write_text(json.dumps({"poses": poses}))
-    assert render([f"{run}", f"{tmp_path / 'own'}", f"path={tmp_path / 'poses.json'}"]) == 0
-    shown = pictures(tmp_path / "own")
-    assert len(shown) == 3
-    for picture, view in zip(shown, front, strict=False):
-        # The pose goes through its inverse twice.
-        assert np.abs(picture.astype(int) - rendered(stored_street(), view)).max() <= 1
-    assert f"3 frames of {tmp_path / 'poses.json'} at 10 a second, made" in capsys.readouterr().out
-
-
-def test_another_rig(run, tmp_path):
-    words = ["cameras=0", "frames=0:1", "up=1.0", "fov=100", "width=60", "height=30"]
-    assert render([f"{run}", f"{tmp_path / 'a'}", *words]) == 0
-    (shown,) = pictures(tmp_path / "a")
-    path = recorded(street_views(cameras=(0,)))[:1]
-    expected = rig.pinholes(rig.cropped(resized(rig.raised(path, 1.0), 60), 30), 100.0)[0][0]
-    assert np.array_equal(shown, rendered(stored_street(), expected))
-
-
-def test_layers_are_folders_of_exact_values_with_tables(run, tmp_path):
-    out = tmp_path / "layers"
-    words = ["layers=[rgb,depth,alpha,nodes,instances]", "cameras=[0,2]", "frames=1:3"]
-    assert render([f"{run}", f"{out}", *words]) == 0
-    assert sorted(path.name for path in out.iterdir()) == [
-        "alpha", "depth", "instances", "instances.json", "nodes", "nodes.json", "rgb",
-    ]  # fmt: skip
-    view = next(view for view in street_views() if view.indices == (2, 2))
-    expected = layer_values(stored_street(), view, LAYERS)
-    for layer in LAYERS:
-        found = np.asarray(Image.open(out / layer / "camera_2" / "00001.png"))
-        assert np.array_equal(found, expected[layer])
-        assert found.dtype == expected[layer].dtype
-    assert json.loads((out / "nodes.json").read_text()) == {"1": "background", "2": "rigid"}
-    assert json.loads((out / "instances.json").read_text())["2"]["name"] == "tram"
-
-
-def test_seen_images_are_training_images_and_counted_before_edits(run, tmp_path):
-    (tmp_path / "edits.yaml").write_text("remove: [car]", encoding="utf-8")
-    words = ["layers=[seen]", f"edits={tmp_path / 'edits.yaml'}", "cameras=0", "frames=1:2"]
-    assert render([f"{run}", f"{tmp_path / 'out'}", *words]) == 0
-    stored, views = stored_street(), read_views(run / "views.json")
-    count_images(stored, views.training)
-    bare = replace(stored, scene=edited(stored.scene.eval(), Edits({"car": REMOVED})))
-    view = next(view for view in views.all if view.indices == (1, 0))
-    (shown,) = pictures(tmp_path / "out" / "seen")
-    assert np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])
-    count_images(bare, views.all)
-    assert not np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])

@@ -1,12 +1,10 @@
 """The table on the command line."""
 
 import json
-import typing
 
 import pytest
 
-from sparsestreet.cli.commands.report import ReportRequest, report
-from sparsestreet.metrics.definitions import PROTOCOLS
+from sparsestreet.cli.commands.report import report
 from sparsestreet.records.summary import SUMMARY
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import write_sweep
@@ -50,18 +48,6 @@ def test_records_of_runs_are_kept_in_a_line_each(tmp_path, capsys):
     assert (first["quality"]["training"]["psnr_full"], first["quality"]["held_out"]["psnr_vehicle"]) == (28.25, 22.0)
     assert (second["gaussians"], second["bytes_total"]) == ({"background": 7}, 4 * 59 * 7)
     assert second["quality"]["held_out"]["psnr_full"] == 24.125
-
-
-def test_protocols_are_those_of_the_metrics():
-    assert typing.get_args(typing.get_type_hints(ReportRequest)["protocol"]) == tuple(PROTOCOLS)
-
-
-def test_errors_are_one_line(runs, tmp_path, capsys):
-    assert report([str(tmp_path / "nothing")]) == 1
-    assert report([str(runs), "baseline=ours"]) == 1
-    assert report([str(runs / "a"), "sections=mean"]) == 1
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert [line.split(":")[0] for line in lines] == ["sparsestreet report"] * 3
 
 
 @pytest.mark.lengthy

