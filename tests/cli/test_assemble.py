@@ -79,7 +79,7 @@ def test_every_value_of_a_recipe():
 
 def test_the_split_and_the_order_are_the_configurations(log):
     data = data_of(composed(*WORDS))
-    assert data.driving_log is log
+    assert data.driving_log == log
     assert (data.seed, data.val_frames, data.split_in_words) == (7, 2, "every 4th frame from 1")
     assert data.split.held_out_indices == {1, 5, 9}
 

@@ -60,7 +60,7 @@ def run(tiny_street, tmp_path_factory) -> Path:
     """A short run with everything that is our own; its events come every fifth step, the rule at the twelfth."""
     out = tmp_path_factory.mktemp("extending") / "run"
     parts = ["node=[background,bobbing]", "effects=[sky,gain]", "loss=[photometric,sky,depth,mean_color]"]
-    masks = ["sparsify=size", "schedule.mask_learning_rate=1.0", "schedule.lambda_m=30.0", "image_points=none"]
+    masks = ["sparsify=size", "schedule.mask_learning_rate=1.0", "schedule.lambda_m=3.0", "image_points=none"]
     rule = ["callback.pruning.rule.meters=0.1", "callback.phase_times.every=3"]
     every = ["schedule.refine_in.every=5", "schedule.mask_in.every=5", "trainer.log_every_n_steps=1"]
     short = [f"schedule.max_steps={STEPS}", f"trainer.val_check_interval={STEPS}"]

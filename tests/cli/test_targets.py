@@ -11,7 +11,6 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.commands.bench import bench
 from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.cli.commands.export import export
 from sparsestreet.cli.commands.objects import objects
@@ -81,7 +80,6 @@ def opened_by(run: Path, out: Path) -> list[Callable[[], int]]:
         lambda: export([str(run), str(out / "a.usdz")]),
         lambda: view([str(run), "device=cpu", "port=0"]),
         lambda: serve([str(run), "device=cpu", "port=0"]),
-        lambda: bench(["edits", "--street", str(run), "--quick", "--out", str(out)]),
     ]
 
 
@@ -96,11 +94,8 @@ def test_nothing_that_a_received_run_names_is_made_by_any_command(tmp_path, monk
         wrap = WRAPPED[(number + number // len(WRAPPED)) % len(WRAPPED)]
         run = run_with(tmp_path / "run", PLACES[number % len(PLACES)], wrap(part))
         commands = opened_by(run, tmp_path)
-        try:
-            status: object = commands[number % len(commands)]()
-        except SystemExit as error:  # of bench
-            status = str(error)
-        said = capfd.readouterr().err + str(status)
+        status = commands[number % len(commands)]()
+        said = capfd.readouterr().err
         assert status not in (0, 2), (part, wrap, said)
         assert f"{run}/.hydra/config.yaml" in said, (part, said)
         assert said.count("\n") <= 1
@@ -121,7 +116,7 @@ def test_the_closed_list_has_what_conf_names():
     """Found once more, by the letters; what stands under hydra is no part of a run."""
     found = {name for path in CONF.rglob("*.yaml") for name in re.findall(r"_target_: ([\w.]+)", path.read_text())}
     assert found - {"sparsestreet.cli.runs.sweep.SweepFolder"} == set(named_by_conf().targets)
-    assert len(found) > 80
+    assert len(found) > 60
     assert "sparsestreet.scene.body.SmplFile" in found  # a comment offers it
     texts = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
     assert texts.count("_target_") == len(re.findall(r"_target_: [\w.]+", texts))  # none is hidden in a text
