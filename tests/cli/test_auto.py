@@ -66,16 +66,6 @@ def test_a_folder_that_no_reader_knows_lists_what_each_missed(tmp_path):
     assert "docs/datasets/README.md" in lines[0]
 
 
-@pytest.mark.parametrize(
-    ("name", "folder", "root"),
-    [("nuscenes", "v1.0-mini", ""), ("kitti", "2011_09_26/2011_09_26_drive_0001_sync", ""), ("colmap", "", "a")],
-)
-def test_a_folder_too_deep_or_too_high_names_the_right_one(name, folder, root, tmp_path):
-    touch(tmp_path / root, FILES[name])
-    with pytest.raises(ValueError, match=f"no reader knows .*, but {tmp_path / root} is for data={name}: name that"):
-        found_option(tmp_path / folder)
-
-
 def test_a_folder_of_two_data_sets_names_both(tmp_path):
     touch(tmp_path, FILES["nerfstudio"], FILES["colmap"])
     with pytest.raises(ValueError, match=r"data=colmap .* and data=nerfstudio .*: name the one that is meant"):

@@ -38,13 +38,6 @@ def test_the_whole_street_at_a_time(run, tmp_path, capsys):
     assert f"{ROAD_ROWS + CAR_ROWS + TRAM_ROWS} Gaussians at time 0.5" in capsys.readouterr().out
 
 
-def test_edits_are_honored(run, tmp_path):
-    write_views(run / "views.json", street_views(), [], frame_rate=10.0)
-    (tmp_path / "edits.yaml").write_text("remove: [tram]")
-    assert export([f"{run}", f"{tmp_path / 'a.ply'}", f"edits={tmp_path / 'edits.yaml'}"]) == 0
-    assert len(means(tmp_path / "a.ply")) == ROAD_ROWS + CAR_ROWS
-
-
 def test_a_street_is_one_file_that_commands_open(run, tmp_path, capsys):
     write_views(run / "views.json", street_views(), [], frame_rate=10.0)
     small = tmp_path / "small.street"

@@ -7,15 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hydra.utils import instantiate
 from PIL import Image
 
 from sparsestreet.cli.commands.render import render
 from sparsestreet.cli.config.compose import load_run_config
-from sparsestreet.export import video
 from sparsestreet.export.path import shifted
-from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
 from tests.export.street import stored_street, street_views
@@ -86,24 +83,6 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
     assert "at 40 a second (the log's speed, 10 of its frames a second)" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    "error",
-    [None, MemoryError(), RuntimeError("CUDA out of memory.\nTried to"), torch.OutOfMemoryError("out of memory")],
-)
-def test_where_memory_does_not_do_it_is_one_line(run, tmp_path, error, capsys, monkeypatch):
-    def out_of_memory(*told):
-        raise error
-
-    if error is None:
-        monkeypatch.setattr(rasterizer, "PAIR_LIMIT", 5)
-    else:
-        monkeypatch.setattr(video, "side_by_side", out_of_memory)
-    assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 1
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert ("more than the 5 that may be held" if error is None else "render: memory is out") in said
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
 @pytest.mark.lengthy
 def test_the_lidar_of_the_log_that_trained_the_run(finished, tmp_path, capsys):
     """Returns of the recorded depth images, which the reader made of the same sweeps in its own way."""
@@ -123,13 +102,3 @@ def test_the_lidar_of_another_log_is_refused(finished, tmp_path, capsys):
     description.write_text(re.sub(r'"data_hash": "\w{8}', '"data_hash": "00000000', description.read_text()))
     assert render([str(run), str(tmp_path / "out"), "layers=[lidar]"]) == 1
     assert "the log is not the one that" in capsys.readouterr().err
-
-
-def test_ctrl_c_leaves_nothing(run, tmp_path, monkeypatch, capsys):
-    def interrupt(images):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(video, "side_by_side", interrupt)
-    assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 130
-    assert "stopped, nothing was written" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]

@@ -136,10 +136,6 @@ def test_a_simulators_preset_differs_in_its_moved_views_alone():
     assert settings == MovedViews(every=2, depth_weight=8.0, color_weight=8.0)
 
 
-def test_they_can_be_left_out():
-    assert recipe_of(composed("moved_views=none")).moved_views is None
-
-
 PROTOCOLS = sorted(path.stem for path in (CONF / "protocol").glob("*.yaml"))
 OMNIRE = {
     "10455472356147194054_1560_000_1580_000": (0, 150),

@@ -17,7 +17,6 @@ from sparsestreet.cli.runs.sweep import (
     as_sweep,
     finished,
     job_problem,
-    note_of_sweep,
     run_job,
     sweep_problem,
     sweep_status,
@@ -150,14 +149,6 @@ def test_a_named_sweep_is_one_without_its_flag():
     assert as_sweep(["+sweep=tiny"]) == ["-m", "+sweep=tiny"]
     for asked in (["seed=1"], ["-m", "+sweep=tiny"], ["+sweep=tiny", "--cfg", "job"], ["+sweep=tiny", "--cfg=job"]):
         assert as_sweep(asked) == asked
-
-
-def test_a_shown_sweep_says_what_its_jobs_differ_in():
-    assert note_of_sweep(["+sweep=rules", "--cfg", "job"]) == (
-        "one configuration is shown; the jobs of the sweep differ in experiment, schedule.removal_at, seed "
-        "(conf/sweep/rules.yaml)"
-    )
-    assert note_of_sweep(["+sweep=rules"]) is note_of_sweep(["--cfg", "job"]) is None
 
 
 @pytest.mark.parametrize(
