@@ -94,7 +94,6 @@ def finished(tiny_street, tmp_path_factory) -> Path:
 
 
 TIMED_ONCE = [f"evaluation.timing.{name}={count}" for name, count in (("warmup", 1), ("repeats", 2), ("rounds", 1))]
-TIMED_BY_DEFAULT = [f"~{word.partition('=')[0]}" for word in TIMED_ONCE]
 
 
 TINY_BACKGROUND = [
@@ -114,6 +113,11 @@ ALL_STAGES = [
     "sparsify=removal",
     # A budget relative to the error would take most of a scene that is hardly trained.
     "schedule.removal_db=0.0",
+    # With a reset, so that a pause after one can be interrupted too.
+    "schedule.reset_in.start=0.3",
+    "schedule.reset_in.stop=0.35",
+    "schedule.reset_in.every=10",
+    "schedule.pause_after_reset=12",
 ]
 TINY_PEOPLE = [
     "node.smpl.body.num_vertices=500",

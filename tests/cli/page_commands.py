@@ -35,7 +35,7 @@ RUN_ELSEWHERE = (
     (r"train resume=RUN", "needs a run that was interrupted", "tests/cli/test_resume.py"),
     (r"hydra/launcher=joblib", "starts processes", "tests/cli/test_killed_sweep.py"),
     (r"hydra/launcher=submitit", "needs a cluster", "tests/cli/test_submitit.py"),
-    (r"trainer=ddp", "starts processes", "tests/cli/test_several_processes.py"),
+    (r"trainer=ddp", "starts processes", "tests/training/parallel/test_several.py"),
     (r"train \+sweep=(?!tiny|NAME)", "takes hours; every job is composed", "tests/cli/test_sweep.py"),
     (r"hydra\.searchpath", "needs files of the reader's own", "tests/cli/test_extending.py"),
 )

@@ -5,12 +5,10 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.commands.data import data
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import CONF
 from sparsestreet.cli.config.log_from_options import found_option, with_found_data
 from tests.cli.configurations import composed
-from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 
 OPTIONS = {path.stem for path in (CONF / "data").glob("*.yaml") if "root" in set(OmegaConf.load(path))}
 FILES = {
@@ -47,11 +45,6 @@ def test_a_folder_is_known_by_a_file(name, tmp_path):
     assert (tmp_path / FILES[name]).is_relative_to(why)
 
 
-@pytest.mark.parametrize("make", [make_nuscenes, make_waymo])
-def test_drivestudios_layout_is_known_whoever_recorded_it(make, tmp_path):
-    assert found_option(make(tmp_path))[0] == "drivestudio"
-
-
 def test_the_options_of_the_reader_that_is_found_apply(tmp_path):
     words, said = with_found_data(["seed=3", "data=auto", f"data.root={touch(tmp_path, FILES['kitti'])}"])
     assert words == ["seed=3", "data=kitti", f"data.root={tmp_path}"]
@@ -59,24 +52,9 @@ def test_the_options_of_the_reader_that_is_found_apply(tmp_path):
     assert composed(*words).data == composed("data=kitti", f"data.root={tmp_path}", "seed=3").data
 
 
-def test_nothing_else_is_touched():
-    assert with_found_data(["data=kitti", "-m"]) == (["data=kitti", "-m"], None)
-
-
-def test_colmaps_cameras_are_no_other_calibration(tmp_path):
-    """A log of one's own keeps its calibration in cameras.json, beside the rig.json that was made of it."""
-    assert found_option(touch(tmp_path, "cameras.json", "rig.json", "cameras.yaml"))[0] == "rig_json"
-    assert found_option(touch(tmp_path / "b", "cameras.txt"))[0] == "colmap"
-
-
 def test_an_empty_folder_is_one_line(tmp_path):
     with pytest.raises(ValueError, match=rf"data.root={tmp_path} is an empty folder: name that of a log; [^\n]*$"):
         found_option(tmp_path)
-
-
-def test_a_folder_in_quotes(tmp_path):
-    odd = touch(tmp_path / "a, b=c", FILES["nuscenes"])
-    assert with_found_data(["data=auto", f"data.root='{odd}'"])[0][0] == "data=nuscenes"
 
 
 def test_a_folder_that_no_reader_knows_lists_what_each_missed(tmp_path):
@@ -86,16 +64,6 @@ def test_a_folder_that_no_reader_knows_lists_what_each_missed(tmp_path):
     assert [line.split(":")[0].strip() for line in lines[1:]] == sorted(f"data={name}" for name in FILES)
     assert "  data=nuscenes: */sample_data.json" in lines
     assert "docs/datasets/README.md" in lines[0]
-
-
-@pytest.mark.parametrize(
-    ("name", "folder", "root"),
-    [("nuscenes", "v1.0-mini", ""), ("kitti", "2011_09_26/2011_09_26_drive_0001_sync", ""), ("colmap", "", "a")],
-)
-def test_a_folder_too_deep_or_too_high_names_the_right_one(name, folder, root, tmp_path):
-    touch(tmp_path / root, FILES[name])
-    with pytest.raises(ValueError, match=f"no reader knows .*, but {tmp_path / root} is for data={name}: name that"):
-        found_option(tmp_path / folder)
 
 
 def test_a_folder_of_two_data_sets_names_both(tmp_path):
@@ -134,21 +102,3 @@ def test_a_wrong_command_is_answered_before_anything_is_read(words, said, tmp_pa
     written = capsys.readouterr().err
     assert said in written
     assert written.startswith("sparsestreet train: ")
-
-
-def test_a_check_says_which_reader_it_asked_and_what_it_still_needs(tmp_path, capsys):
-    assert data(["check", str(make_nuscenes(tmp_path / "a")), "split.stride=0"]) == 0
-    assert capsys.readouterr().out.startswith("data=drivestudio, as ")
-    two = touch(tmp_path / "b", FILES["kitti"])
-    (two / "2011_09_26/2011_09_26_drive_0002_sync").mkdir()
-    assert data(["check", str(two)]) == 2
-    assert "name one (data.log.drive)" in capsys.readouterr().err
-
-
-def test_a_reader_that_cannot_be_imported_is_named(tmp_path):
-    conf = tmp_path / "conf/data"
-    conf.mkdir(parents=True)
-    (conf / "mine.yaml").write_text("root: ???\nlog: {_target_: nobody.has.Reader}\n")
-    words = [f"hydra.searchpath=[file://{conf.parent}]", "data=auto", f"data.root={tmp_path}"]
-    with pytest.raises(ValueError, match=r"data=mine names nobody\.has\.Reader, which cannot be imported"):
-        with_found_data(words)

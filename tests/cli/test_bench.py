@@ -12,30 +12,9 @@ from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.cli.commands import bench as cli_bench
 from sparsestreet.cli.commands.bench import bench, trained_street
 from sparsestreet.cli.runs import run as cli_step
-from sparsestreet.ops import splat
-from sparsestreet.records.run import this_machine, this_source
 from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import read_views, write_views
 from tests.export.street import stored_street, street_views
-
-
-def test_help_teaches_by_example(capsys):
-    assert bench(["--help"]) == 0
-    text = capsys.readouterr().out
-    assert all(f"sparsestreet bench {mode}" in text for mode in ("settings", "blend", "step", "costs", "scaling"))
-
-
-def test_unknown_mode_is_refused(capsys):
-    for words, said in (
-        (["setting"], "mode must be one of settings, blend, step, costs, scaling, got 'setting'"),
-        (["--quick"], "'--quick' is no option: write key=value, with one of mode, quick, street, threads, out"),
-        (["blend", "sed=1"], "no key 'sed'; there are mode, quick, street, threads, out"),
-        (["blend", "street=RUN"], "street=RUN is for the modes settings and costs, got blend: leave it out"),
-        (["costs"], "name the folder of its run with street=RUN"),
-        (["blend", "threads=0"], "threads is at least 1, got 0"),
-    ):
-        assert bench(words) == 2
-        assert said in capsys.readouterr().err
 
 
 def test_records_name_command_and_threads(tmp_path, capsys):
@@ -44,53 +23,6 @@ def test_records_name_command_and_threads(tmp_path, capsys):
     assert first["provenance"]["command"].startswith("sparsestreet bench scaling quick=true")
     assert first["provenance"]["threads"] == torch.get_num_threads()
     assert first["rows"] < min(scaling.ROWS)
-
-
-@pytest.mark.slow
-def test_step_times_and_counts_the_phases_of_a_training(tmp_path, tiny_street, capsys):
-    assert (
-        bench(["step", "quick=true", f"out={tmp_path}", *tiny_street, "sparsify=masks", "callback.phase_times.every=1"])
-        == 0
-    )
-    record = json.loads((tmp_path / "step.jsonl").read_text())
-    phases = {phase["name"]: phase for phase in record["phases"]}
-    every_step = {"data", "scene", "splat", "sky", "loss photometric", "loss mask_sparsity", "splat backward",
-                  "scene backward", "backward", "optimizer", "density statistics", "loop"}  # fmt: skip
-    assert every_step <= phases.keys()
-    assert sum(phase["time"]["median"] for phase in phases.values()) == pytest.approx(
-        record["step"]["median"], rel=0.5
-    )  # medians of parts beside the median of the whole
-    assert sum(phase["operations"] for phase in phases.values()) == pytest.approx(record["operations"])
-    assert phases["splat"]["floor_ms"] > 0
-    assert record["gaussians"].keys() == {"background", "rigid"}
-    assert (tmp_path / "step.png").stat().st_size > 10_000
-    assert "times its op" in capsys.readouterr().out
-
-
-def test_step_refuses_what_train_refuses(tmp_path, capsys):
-    assert bench(["step", "quick=true", f"out={tmp_path}", "schedule.max_stps=3"]) == 2
-    assert "bench: no key 'schedule.max_stps'" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_that_is_no_run(tmp_path):
-    with pytest.raises(FileNotFoundError, match="there is no scene at"):
-        trained_street(tmp_path)
-
-
-@pytest.mark.slow
-def test_the_street_of_a_run_is_what_the_run_renders(run_train, tmp_path):
-    run = run_train(tmp_path / "run", "schedule.max_steps=20")
-    street = trained_street(run)
-    assert street.source.startswith("trained: run on ")
-    assert not street.gaussians.means.requires_grad
-    views = read_views(run / "views.json").all
-    view = views[len(views) // 2]
-    assert street.source.endswith(f"frame {view.frame_index}")
-    with torch.no_grad():
-        again = splat(street.gaussians, street.camera)
-    assert torch.equal(again.rgb, load_scene(run).render(view).splats.rgb)  # without the sky
-    assert float(again.alpha.mean()) > 0.2
 
 
 @pytest.fixture
@@ -154,20 +86,6 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
     if mode == "step":
         ((overrides, _),) = trained
         assert overrides == ["seed=3"]
-
-
-def test_threads_and_words_stand_in_the_record(handed, monkeypatch, tmp_path):
-    before = torch.get_num_threads()
-    numbers = []
-    monkeypatch.setattr(torch, "set_num_threads", numbers.append)
-    bench(["blend", f"threads={before + 1}", f"out={tmp_path / 'a b'}"])
-    assert numbers == [before + 1]
-    provenance = handed["run_blend"][0][4]._provenance
-    assert provenance.command == f"sparsestreet bench blend threads={before + 1} 'out={tmp_path / 'a b'}'"
-    assert (provenance.threads, provenance.machine, provenance.source) == (before, this_machine(), this_source())
-    numbers.clear()
-    bench(["blend", f"out={tmp_path}"])
-    assert numbers == []
 
 
 def test_the_street_of_a_run_is_the_view_in_its_middle(tmp_path):

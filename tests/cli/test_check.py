@@ -4,7 +4,6 @@ import shutil
 import sys
 import sysconfig
 import warnings
-from pathlib import Path
 
 import pytest
 import torch
@@ -59,92 +58,68 @@ def said(capsys: pytest.CaptureFixture[str], part: str) -> str:
     return last
 
 
-@pytest.mark.parametrize("driver", [True, False])
-def test_a_build_of_torch_without_cuda_is_one_line(gpu, capsys, driver):
-    gpu.setattr(torch.version, "cuda", None)
-    gpu.setattr(command, "has_driver", lambda: driver)
-    line = said(capsys, "torch")
-    assert f"torch {torch.__version__} is a build without CUDA" in line
-    assert "--index-url https://download.pytorch.org/whl/cu130" in line
-    assert ("install its driver" in line) != driver
+def too_old() -> bool:
+    said = "CUDA initialization: the driver is too old (found 12020). (Triggered internally at x.cpp:1)"
+    warnings.warn(said, stacklevel=2)
+    return False
 
 
-def test_a_torch_whose_libraries_do_not_load(gpu, capsys):
-    gpu.setitem(sys.modules, "torch", None)  # makes the import fail
-    assert "torch cannot be imported (" in said(capsys, "torch")
+def fails(message: str):
+    def raises(*given, **how):
+        raise RuntimeError(f"{message}\nmore")
+
+    return raises
 
 
-def test_a_driver_that_is_too_old(gpu, capsys):
-    def too_old() -> bool:
-        said = "CUDA initialization: the driver is too old (found 12020). (Triggered internally at x.cpp:1)"
-        warnings.warn(said, stacklevel=2)
-        return False
+MISSING = [
+    # What is replaced and by what, the part that is missing, what is said.
+    (torch.version, "cuda", None, "torch", "is a build without CUDA: pip uninstall torch"),
+    (torch.cuda, "is_available", too_old, "device", "the driver is too old (found 12020).: a driver must be as new as"),
+    (torch.cuda, "get_device_capability", lambda: (7, 5), "device", "compute capability 7.5, and kernels need 8.0"),
+    (
+        torch,
+        "ones",
+        fails("CUDA error: no kernel image"),
+        "device",
+        "cannot compute on NVIDIA H100",
+    ),
+    (
+        shutil,
+        "which",
+        lambda name: None,
+        "compiler",
+        "there is no C compiler, and Triton calls one",
+    ),
+    (sysconfig, "get_path", lambda name: "/nowhere", "headers", "there is no /nowhere/Python.h, which Triton compiles"),
+    (torch.cuda, "mem_get_info", lambda: (0.4e9, 80.0e9), "memory", "0.4 of 80.0 GB are free: nvidia-smi lists who"),
+    (
+        accuracy,
+        "answer",
+        fails("ptxas fatal"),
+        "splat",
+        "RuntimeError: ptxas fatal; with the versions",
+    ),
+]
 
-    gpu.setattr(torch.cuda, "is_available", too_old)
-    line = said(capsys, "device")
-    assert "the driver is too old (found 12020).: a driver must be as new as CUDA 13.0" in line
+
+@pytest.mark.parametrize(
+    ("owner", "name", "replaced", "part", "text"), MISSING, ids=[f"{one[3]} {one[1]}" for one in MISSING]
+)
+def test_what_is_missing_is_one_line_with_its_remedy(gpu, capsys, owner, name, replaced, part, text):
+    gpu.setattr(owner, name, replaced)
+    line = said(capsys, part)
+    assert text in line
+    assert "more" not in line
     assert "Triggered" not in line
 
 
-def test_no_driver_at_all(gpu, capsys):
-    gpu.setattr(torch.cuda, "is_available", lambda: False)
-    gpu.setattr(command, "has_driver", lambda: False)
-    assert "torch sees no CUDA device: install NVIDIA's driver; in a container" in said(capsys, "device")
-
-
-def test_a_device_that_is_too_old_for_kernels(gpu, capsys):
-    gpu.setattr(torch.cuda, "get_device_capability", lambda: (7, 5))
-    assert "compute capability 7.5, and kernels need 8.0" in said(capsys, "device")
-
-
-def test_a_device_that_this_build_has_no_code_for(gpu, capsys):
-    def unknown(*size, **how):
-        raise RuntimeError("CUDA error: no kernel image is available for execution on the device\nmore")
-
-    gpu.setattr(torch, "ones", unknown)
-    line = said(capsys, "device")
-    assert "cannot compute on NVIDIA H100, compute capability 9.0: CUDA error: no kernel image" in line
-    assert "pip install -c constraints.txt torch" in line
-
-
-def test_no_compiler(gpu, capsys):
-    gpu.setattr(shutil, "which", lambda name: None)
-    assert "there is no C compiler, and Triton calls one: apt-get install gcc" in said(capsys, "compiler")
-    gpu.setenv("CC", "icc")
-    assert "the C compiler that CC names (icc) is not there" in said(capsys, "compiler")
-
-
-def test_clang_is_a_compiler_too(gpu, capsys):
-    gpu.setattr(shutil, "which", lambda name: "/usr/bin/clang" if name == "clang" else None)
-    assert check([]) == 0
-    assert "compiler  /usr/bin/clang" in capsys.readouterr().out
-
-
-def test_no_headers_and_no_triton(gpu, capsys):
-    gpu.setitem(sys.modules, "triton", None)  # makes the import fail
-    line = said(capsys, "headers")
-    assert "Triton cannot be imported" in line
-    assert "pip install 'sparsestreet[gpu]'" in line
-    gpu.setattr(sysconfig, "get_path", lambda name: "/nowhere")
-    version = f"{sys.version_info.major}.{sys.version_info.minor}"
-    assert f"there is no /nowhere/Python.h, which Triton compiles with: apt-get install python{version}-dev" in said(
-        capsys, "headers"
-    )
-
-
-def test_no_memory(gpu, capsys):
-    gpu.setattr(torch.cuda, "mem_get_info", lambda: (0.4e9, 80.0e9))
-    assert "0.4 of 80.0 GB are free: nvidia-smi lists who holds the rest" in said(capsys, "memory")
-
-
-def test_a_kernel_that_does_not_compile(gpu, capsys):
-    def broken(*given):
-        raise RuntimeError("ptxas fatal: Unsupported .version 9.2\nmore")
-
-    gpu.setattr(accuracy, "answer", broken)
-    line = said(capsys, "splat")
-    assert "RuntimeError: ptxas fatal: Unsupported .version 9.2; with the versions of constraints.txt" in line
-    assert "more" not in line
+@pytest.mark.parametrize(
+    ("module", "part", "text"),
+    [("torch", "torch", "torch cannot be imported ("), ("triton", "headers", "pip install 'sparsestreet[gpu]'")],
+)
+def test_what_cannot_be_imported(gpu, capsys, module, part, text):
+    gpu.setitem(sys.modules, module, None)  # makes the import fail
+    assert text in said(capsys, part)
 
 
 @pytest.mark.parametrize("part", ["image", "gradients"])
@@ -168,11 +143,3 @@ def test_words(capsys):
     assert "whether a GPU can train here" in capsys.readouterr().out
     assert check(["now"]) == 2
     assert "takes no arguments, got now" in capsys.readouterr().err
-
-
-def test_drivers_show_their_devices(monkeypatch):
-    monkeypatch.setattr(shutil, "which", lambda name: None)
-    monkeypatch.setattr(Path, "exists", lambda self: False)
-    assert not command.has_driver()
-    monkeypatch.setattr(Path, "exists", lambda self: str(self) == "/dev/nvidiactl")
-    assert command.has_driver()

@@ -1,18 +1,15 @@
-"""`sparsestreet data`: what it looks at, what it makes, and one line on what is wrong."""
+"""``sparsestreet data``: what it looks at, makes and converts, and one line on what is wrong."""
 
-from dataclasses import MISSING, fields
-from pathlib import Path
+import json
+from collections.abc import Iterable, Iterator
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.utils import instantiate
 
+from sparsestreet.cli.commands import data as module
 from sparsestreet.cli.commands.data import data
-from sparsestreet.cli.config.compose import CONF
+from sparsestreet.data.convert import LogFile, partial_folder
 from sparsestreet.data.drivestudio import DriveStudioReader
-from sparsestreet.data.synthetic import LidarSensor, StreetReader, StreetSettings
-from tests.conftest import unchecked
-from tests.data.drivestudio.folders import make_nuscenes, make_waymo, write_lines
+from tests.data.drivestudio.folders import make_nuscenes, make_waymo
 
 SMALL = [
     "data.lidar.beams=4",
@@ -31,68 +28,13 @@ SPLIT = "split.offset=1"
 """Of so few frames the usual split would hold out none."""
 
 
-@pytest.fixture
-def lens(tmp_path) -> Path:
-    """A log of 12 frames whose second camera has a lens without inverse, and whose frame 7 lacks its points."""
-    make_waymo(tmp_path, frames=12)
-    write_lines(tmp_path / "intrinsics/1.txt", [40.0, 40, 20, 12, 0, 0, 1, 1, 0])
-    (tmp_path / "lidar/007.bin").unlink()
-    return tmp_path
-
-
-@pytest.mark.parametrize("say", [lambda root: f"{root}", lambda root: f"data.root={root}"])
-def test_a_folder_is_checked_as_it_is_or_by_its_key(say, tmp_path, capsys):
-    assert data(["check", say(make_nuscenes(tmp_path)), SPLIT]) == 0
-    assert "ready to train" in capsys.readouterr().out
-
-
-def test_a_folder_may_be_named_as_it_likes(tmp_path, capsys):
-    odd = tmp_path / "a, b {c} $d 'e'"
-    assert data(["check", str(make_nuscenes(odd)), SPLIT]) == 0
-    assert "ready to train" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("choice", "count"),
-    [
-        ([], 2),
-        (["data.log.cameras=[0]"], 1),
-        (["data.log.last_frame=6"], 1),
-        (["data.log.first_frame=8", "data.log.cameras=[0]"], 0),
-        (["data.log.last_frame=5", "data.log.cameras=[0]"], 0),
-    ],
-)
-def test_only_what_would_be_read_is_checked(choice, count, lens, capsys):
-    assert data(["check", str(lens), *choice, SPLIT]) == (1 if count else 0)
-    printed = capsys.readouterr().out
-    assert (f"{count} to repair" if count else "ready to train") in printed
-    if "data.log.first_frame=8" in choice:
-        assert "4 x 1" in printed
-
-
-def test_the_check_says_what_a_lens_does(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "300")
-    write_lines(make_waymo(tmp_path) / "intrinsics/1.txt", [40.0, 40, 20, 12, 0.25, 0, 0, 0, 0])
-    assert data(["check", str(tmp_path), SPLIT]) == 0
-    assert "camera 1: its lens moves pixels by up to" in capsys.readouterr().out
-
-
-def test_the_size_is_the_one_that_would_be_read(tmp_path, capsys):
-    assert data(["check", str(make_nuscenes(tmp_path)), "data.log.width=20", SPLIT]) == 0
-    assert "20x12" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["check"], "say sparsestreet data check DIR"),
-        (["check", "a", "b"], "name one folder"),
-        (["check", "a", "data=synthetic"], "name one folder"),
         (["check", "{log}", "data.log.width=41"], "width must be within 1 to 40"),
-        (["check", "{log}", "data.log.cameras=[7]"], "cameras [7] must be different ones of the log's [0, 1]"),
         (["check", "{log}", "data.log.last_frme=3"], "no key 'data.log.last_frme'"),
         (["make", "data=drivestudio", "data.root={log}"], "only data=synthetic can be made"),
-        (["make", "data.log.settings.width=-5"], "StreetSettings.width must be positive but is -5"),
         (["make", *SMALL, "data.log.root={log}"], "holds something else"),
     ],
 )
@@ -106,44 +48,92 @@ def test_a_wrong_command_is_answered_in_one_line(arguments, words, tmp_path, cap
     assert written.out in ("", f"data=drivestudio, as {log}/images/000_0.jpg tells\n")
 
 
-def test_streets_of_other_settings_lie_beside_each_other(tmp_path, capsys):
-    with unchecked():
-        for choice in ([], ["data.log.settings.ego_speed=5.0"], []):
-            assert data(["make", *SMALL, f"data.log.parent={tmp_path}", *choice]) == 0
+def converted(*words: str) -> int:
+    return data(["convert", *words])
+
+
+def test_the_short_form_finds_the_reader_and_writes_drivestudios_layout(tmp_path, capsys):
+    log, out = make_waymo(tmp_path / "a log, {odd}"), tmp_path / "out"
+    assert converted(f"from={log}", f"to={out}") == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.partition(": ")[2] for line in lines] == ["2 frames of 1 camera"] * 3
-    folders = [line.partition(":")[0] for line in lines]
-    assert folders[0] == folders[2]
-    assert {Path(folder) for folder in folders} == set(tmp_path.iterdir())
-    assert len(set(folders)) == 2
+    assert lines[0] == f"data=drivestudio, as {log}/images/000_0.jpg tells"
+    place = lines.index(f"{out}: 43 files, 0.0 MB, 3 frames of 2 cameras")
+    assert "43 of 43 files" in lines[place - 1]
+    assert lines[place + 1] == "  lost or changed: images become JPEG of quality 95"
+    assert lines[place + 2].startswith("  note: the flavor is waymo, which has cameras that are rigid on a vehicle; ")
+    assert lines[place + 3].startswith("  note: DriveStudio takes sizes of images from datasets/dataset_meta.py")
+    assert (out / "ego_pose/002.txt").is_file()  # as the log, Waymo's flavor
+    assert DriveStudioReader(out).check() == []
 
 
-def test_a_street_is_checked_like_a_log(tmp_path, capsys):
-    with unchecked():
-        assert data(["check", "data=synthetic", *SMALL, f"data.log.root={tmp_path / 'mine'}", SPLIT]) == 0
-    assert "2 x 1" in capsys.readouterr().out
-    assert (tmp_path / "mine/images/000_0.jpg").is_file()
-    (tmp_path / "mine/images/000_0.jpg").unlink()
-    assert data(["check", "data=synthetic", *SMALL, f"data.log.root={tmp_path / 'mine'}"]) == 1
+def test_the_part_and_the_settings_are_chosen_by_keys(tmp_path, capsys):
+    log, out = make_nuscenes(tmp_path / "log"), tmp_path / "out"
+    part = ["data.log.cameras=[1]", "data.log.last_frame=1", "data.log.width=20"]
+    words = ["data=drivestudio", f"data.root={log}", *part, "jpeg_quality=null"]
+    assert converted(*words, f"to={out}") == 0
+    assert {path.name for path in (out / "images").iterdir()} == {"000_1.jpg", "001_1.jpg"}
+    assert (out / "images/000_1.jpg").read_bytes().startswith(b"\x89PNG")
+    said = json.loads((out / "conversion.json").read_text())
+    assert said["source"]["data_hash"] == DriveStudioReader(log, cameras=[1], last_frame=1).data_hash()
+    assert said["source"]["reader"]["width"] == 20
+    assert not {"root", "cache_mb"} & set(said["source"]["reader"])
+    assert said["settings"] == {"jpeg_quality": None, "flavor": "auto"}
+    (line,) = said["losses"]
+    assert line.endswith("knows in its flavor nuscenes (objects): Vehicle is vehicle.car (1)")
+    printed = capsys.readouterr().out
+    assert f"  lost or changed: {line}\n" in printed
+    assert all(f"  note: {note}\n" in printed for note in said["notes"])
+    assert said["notes"][-1].startswith("DriveStudio reads poses of cameras 0 too, which the log lacks")
+
+
+def stopped(files: Iterable[LogFile], total: int, what: str) -> Iterator[LogFile]:
+    yield from list(files)[:10]
+    raise KeyboardInterrupt
+
+
+def test_after_ctrl_c_the_same_command_goes_on(tmp_path, capsys, monkeypatch):
+    words = [f"from={make_nuscenes(tmp_path / 'log')}", f"to={tmp_path / 'out'}"]
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "shown", stopped)
+        assert converted(*words) == 130
+    partial = partial_folder(tmp_path / "out")
+    assert capsys.readouterr().err == (
+        f"sparsestreet data convert: stopped, what is written stays in {partial}: give the same command to go on, or "
+        "remove the folder\n"
+    )
+    assert converted(*words, "data.log.width=20") == 1
+    assert "differs in source, notes: remove it, or name another place" in capsys.readouterr().err
+    assert converted(*words, "data.log.cache_mb=9") == 0
+    assert "files, 10 of them there already, " in capsys.readouterr().out
+    assert not partial.exists()
 
 
 @pytest.mark.parametrize(
-    ("choice", "reader"),
-    [("synthetic", StreetReader), ("synthetic", StreetSettings), ("drivestudio", DriveStudioReader)],
+    ("words", "status", "said"),
+    [
+        (["to={out}"], 2, "no log is named: say sparsestreet data convert from=DIR to=DIR"),
+        (["from={log}"], 2, "to=DIR is missing"),
+        (["from={log}", "from={log}", "to={out}"], 2, "from=DIR names one folder"),
+        (["from={log}", "data.root={log}", "to={out}"], 2, "name the same: leave one out"),
+        (["from={log}", "data=synthetic", "to={out}"], 2, "leave from=... out"),
+        (["from={log}", "to={log}/new"], 2, "lies in the log itself"),
+        (["from={log}", "to={out}", "layout=kitti"], 2, "no key 'layout'"),
+        (["from={log}", "to={out}", "flavor=kitti"], 2, "flavor must be "),
+        (["from={log}", "to={out}", "jpeg_quality=200"], 2, "jpeg_quality lies in 1 to 100, got 200"),
+        (["from={log}", "to={out}", "data.log.last_frame=30"], 1, "are not within the log's 0 to 2"),
+        (["from={log}", "to={full}"], 1, "is no empty folder: name another place with to=..., or remove it"),
+        (["from={empty}", "to={out}"], 1, "is an empty folder"),
+    ],
 )
-def test_every_choice_of_a_reader_is_a_key_with_the_readers_own_default(choice, reader):
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        log = compose("train", [f"data={choice}", "seed=0"]).data.log
-    keys = log.settings if reader is StreetSettings else log
-    assert set(keys) == {"_target_"} | {field.name for field in fields(reader)}
-    for field in fields(reader):
-        if isinstance(field.default, LidarSensor):
-            assert instantiate(keys[field.name]) == field.default
-        elif field.default is not MISSING:
-            assert keys[field.name] == (list(field.default) if isinstance(field.default, tuple) else field.default)
-
-
-@pytest.mark.parametrize(("arguments", "status"), [([], 2), (["look"], 2), (["--help"], 0), (["check", "--help"], 0)])
-def test_usage(arguments, status, capsys):
-    assert data(arguments) == status
-    assert "sparsestreet data check DIR" in capsys.readouterr().out
+def test_a_wrong_command_is_answered_and_nothing_is_written(words, status, said, tmp_path, capsys):
+    places = {"log": make_nuscenes(tmp_path / "log"), "out": tmp_path / "out", "full": tmp_path / "full"}
+    places["empty"] = tmp_path / "empty"
+    places["empty"].mkdir()
+    places["full"].mkdir()
+    (places["full"] / "mine.txt").touch()
+    before = set(tmp_path.rglob("*"))
+    assert converted(*(word.format(**places) for word in words)) == status
+    written = capsys.readouterr().err
+    assert said in written
+    assert written.startswith("sparsestreet data convert: ")
+    assert set(tmp_path.rglob("*")) == before

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 from hydra.utils import get_object
-from lightning import Trainer
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.config.assemble import recipe_of, trainer_of
 from sparsestreet.cli.config.compose import composed
+from sparsestreet.cli.runs.run import recipe_of
 from sparsestreet.scene import effects
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.masks import StaticMaskSettings
@@ -20,7 +19,6 @@ from sparsestreet.training.callbacks import DensityControl, PhaseTimes, RowLedge
 from sparsestreet.training.losses import Depth, Photometric, SkyMask
 from sparsestreet.training.moved_views import MovedViews
 from sparsestreet.training.recipe import Recipe
-from sparsestreet.training.run import CPU_TRAINER
 from sparsestreet.training.schedule import Interval
 from sparsestreet.triangulation import ImagePointSettings
 from tests.typed import as_a
@@ -29,14 +27,6 @@ from tests.typed import as_a
 @pytest.fixture(scope="module")
 def cfg():
     return composed(["schedule=paper", "sparsify=masks"])
-
-
-def test_the_trainer(cfg):
-    configured = trainer_of(cfg, cfg.trainer.devices)
-    assert configured.func is CPU_TRAINER.func is Trainer
-    # What is left out has these values by itself.
-    plain = {"max_steps": cfg.schedule.max_steps, "precision": "32-true", "fast_dev_run": False}
-    assert configured.keywords == CPU_TRAINER.keywords | plain
 
 
 def streetgs() -> Recipe:

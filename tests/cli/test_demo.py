@@ -87,18 +87,6 @@ def test_the_one_comparison_is_the_last_table(trained, tmp_path, monkeypatch, ca
     assert len(lines) - heads[-1] < 14
 
 
-def test_the_first_failure_ends_it(asked, monkeypatch):
-    statuses = iter((0, 130))
-    monkeypatch.setattr(subprocess, "run", lambda *given, **how: SimpleNamespace(returncode=next(statuses)))
-    assert demo([]) == 130
-    assert asked == []
-
-
-def test_help(asked, capsys):
-    assert demo(["--help"]) == 0
-    assert "sparsestreet demo [out=DIR] [key=value ...]" in capsys.readouterr().out
-
-
 @pytest.fixture
 def trained(monkeypatch):
     """Words of each training; each leaves a record (21, 22, 23 dB) and a picture in the folder that it was given."""
@@ -117,30 +105,6 @@ def trained(monkeypatch):
     monkeypatch.setattr(module.subprocess, "run", train)
     monkeypatch.setattr(module, "compare_runs", lambda runs, sheet, legend, titles: sheet.parent.mkdir(exist_ok=True))
     return words
-
-
-@pytest.mark.parametrize("name", ["demo2", "a b = ü"])
-def test_the_demo_writes_where_it_is_told(name, trained, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    SUMMARY.write(tmp_path / "outputs/demo/none", make_summary("plain", 0, 99.0))  # of an earlier demo
-    assert demo([f"out={tmp_path / name}", "seed=1"]) == 0
-    assert sorted(path.name for path in (tmp_path / name).iterdir()) == ["none", "paper_short", "removal", "table.md"]
-    assert [[word for word in words if word.startswith("sparsify=")] for words in trained] == [
-        ["sparsify=none"], ["sparsify=paper_short"], ["sparsify=removal"]
-    ]  # fmt: skip
-    assert all("seed=1" in words and sum(word.startswith("out=") for word in words) == 1 for words in trained)
-    said = capsys.readouterr().out
-    assert "21.00" in said
-    assert "99.00" not in said
-    assert str(tmp_path / name / "removal") in said
-
-
-def test_the_demo_has_a_folder_of_its_own(trained, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert demo([]) == 0
-    assert sorted(path.name for path in (tmp_path / "outputs/demo").iterdir()) == [
-        "none", "paper_short", "removal", "table.md"
-    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("word", ["sparsify=paper", "folder=x", "hydra.run.dir=x", "resume=x", "-m", "out="])

@@ -1,8 +1,9 @@
-"""What docs/extending.md shows, run: each kind of part from outside."""
+"""What docs/extending.md shows, run: each kind of part from outside, and one training with all of them."""
 
 import ast
 import csv
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,29 +13,34 @@ import torch
 from hydra.errors import InstantiationException
 from PIL import Image
 
+from sparsestreet import load_scene
 from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.commands.render import render
+from sparsestreet.cli.commands.report import report
 from sparsestreet.cli.commands.train import train
-from sparsestreet.cli.config.assemble import data_of, recipe_of
 from sparsestreet.cli.config.validate import override_problem
+from sparsestreet.cli.runs.run import data_of, recipe_of
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.pruning import RenderContext
+from sparsestreet.records.costs import COSTS
 from sparsestreet.records.run import RUN
+from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.scene.masks import MaskScope, StaticMask, StaticMaskSettings
+from sparsestreet.scene.masks import MaskScope, StaticMask
 from sparsestreet.scene.nodes import BackgroundSettings
-from sparsestreet.scene.rendering import render
+from sparsestreet.scene.rendering import render as rendered
 from sparsestreet.scene.views import read_views
 from sparsestreet.training.callbacks import Pruning
-from sparsestreet.training.losses import MaskSparsity
 from tests.cli import configurations
-from tests.cli.conftest import TINY_RIGID
+from tests.cli.toy.bobbing import Bobbing
 from tests.cli.toy.density import GrowthDensity
+from tests.cli.toy.gain import Gain
 from tests.cli.toy.loss import MeanColor
 from tests.cli.toy.mask import ProbitMask, ProbitMaskSettings
 from tests.cli.toy.metric import largest_errors
-from tests.cli.toy.ramped import RampedSparsity
 from tests.cli.toy.rule import SizeRule
 from tests.cli.toy.source import DrivenPoints
 from tests.scene.density.scenes import make_rows as rows_at_random
@@ -46,21 +52,26 @@ from tests.typed import as_a
 ROOT = Path(__file__).parents[2]
 OUTSIDE = f"hydra.searchpath=[file://{Path(__file__).parent / 'toy' / 'conf'}]"
 PROBIT = "node.background.mask._target_=tests.cli.toy.mask.ProbitMaskSettings"
+STEPS = 20
+
+
+@pytest.fixture(scope="module")
+def run(tiny_street, tmp_path_factory) -> Path:
+    """A short run with everything that is our own; its events come every fifth step, the rule at the twelfth."""
+    out = tmp_path_factory.mktemp("extending") / "run"
+    parts = ["node=[background,bobbing]", "effects=[sky,gain]", "loss=[photometric,sky,depth,mean_color]"]
+    masks = ["sparsify=size", "schedule.mask_learning_rate=1.0", "schedule.lambda_m=3.0", "image_points=none"]
+    rule = ["callback.pruning.rule.meters=0.1", "callback.phase_times.every=3"]
+    every = ["schedule.refine_in.every=5", "schedule.mask_in.every=5", "trainer.log_every_n_steps=1"]
+    short = [f"schedule.max_steps={STEPS}", f"trainer.val_check_interval={STEPS}"]
+    street = [word for word in tiny_street if not word.startswith(("image_points.", "schedule.", "trainer."))]
+    assert train([*street, OUTSIDE, *parts, PROBIT, *masks, *rule, *every, *short, f"out={out}"]) == 0
+    return out
 
 
 def composed(*overrides: str):
     assert override_problem([OUTSIDE, *overrides]) is None
     return configurations.composed(OUTSIDE, *overrides)
-
-
-@pytest.fixture(scope="module")
-def run(tiny_street, tmp_path_factory) -> Path:
-    """Two steps with everything that is our own; the rule comes in at the first."""
-    out = tmp_path_factory.mktemp("extending") / "run"
-    words = ["method=no_lidar", "loss=[photometric,sky,mean_color]", "sparsify=size", PROBIT]
-    rule = "callback.pruning.rule.meters=0.1"
-    assert train([*tiny_street, *TINY_RIGID, OUTSIDE, *words, rule, f"out={out}", "trainer.fast_dev_run=2"]) == 0
-    return out
 
 
 def test_the_page_shows_the_parts_of_this_folder():
@@ -90,25 +101,10 @@ def test_a_loss(words):
     frame = frame_at()
     frame = replace(frame, image=torch.tensor([51, 102, 153], dtype=torch.uint8).expand(frame.image.shape))
     scene = SceneGraph({"background": background()})
-    rendering = replace(render(scene, frame), rgb=torch.tensor([0.5, 0.6, 0.7]).expand(frame.image.shape))
+    rendering = replace(rendered(scene, frame), rgb=torch.tensor([0.5, 0.6, 0.7]).expand(frame.image.shape))
     assert loss.applies(frame)
     # The colors lie 0.3, 0.2 and 0.1 apart.
     torch.testing.assert_close(loss(rendering, frame, scene), torch.tensor(0.1 * 0.2))
-
-
-def test_lambda_over_time():
-    """0.3 of a run of masks: a quarter of that is a quarter of the weight, behind it all of it."""
-    target = "loss.mask_sparsity._target_=tests.cli.toy.ramped.RampedSparsity"
-    loss = recipe_of(composed("sparsify=paper", target, "++loss.mask_sparsity.ramp=0.3")).losses["mask_sparsity"]
-    assert isinstance(loss, RampedSparsity)
-    scene, frame = SceneGraph({"background": background(9, mask=StaticMaskSettings(sparsity_weight=0.7))}), frame_at()
-    drawn = render(scene, frame)
-    full, some, late = (
-        loss(replace(drawn, state=replace(drawn.state, progress=at)), frame, scene) for at in (0.3, 0.075, 0.9)
-    )
-    whole = MaskSparsity(loss.weight)(drawn, frame, scene)
-    assert whole > 0
-    torch.testing.assert_close(torch.stack([full, some, late]), torch.stack([whole, whole / 4, whole]))
 
 
 def test_a_rule():
@@ -120,14 +116,6 @@ def test_a_rule():
     selection = pruning.rule.select(SceneGraph({"background": node}), [frame_at()], RenderContext())["background"]
     assert (~selection.keep).nonzero().tolist() == [[5]]
     assert selection.floor_hit
-
-
-def test_a_rule_takes_the_place_of_another():
-    """By name, in whichever sparsification prunes; what is left of that one are its moments."""
-    pruning = as_a(
-        Pruning, recipe_of(composed("sparsify=paper", "pruning@callback.pruning.rule=size")).callbacks["pruning"]
-    )
-    assert (pruning.at, pruning.rule) == ((0.93334,), SizeRule(meters=1.0))
 
 
 def test_a_density_strategy():
@@ -174,36 +162,6 @@ def test_a_source():
         recipe_of(composed(chosen))
 
 
-@pytest.mark.parametrize("sparsify", ["none", "paper", "size"])
-def test_a_method_goes_with_every_sparsification(sparsify):
-    cfg = composed("method=no_lidar", f"sparsify={sparsify}")
-    recipe = recipe_of(cfg)
-    assert cfg.name == "no_lidar" + ("" if sparsify == "none" else f"+{sparsify}")
-    assert {"photometric", "sky"} <= set(recipe.losses)
-    assert "depth" not in recipe.losses
-
-
-@pytest.mark.slow
-def test_they_train_together(run):
-    with (run / "records" / "counts.csv").open() as file:
-        pruned = [row for row in csv.DictReader(file) if row["reason"] == "pruning"]
-    assert [row["node"] for row in pruned] == ["background", "rigid"]
-    assert all(int(row["after"]) < int(row["before"]) for row in pruned)
-    description = RUN.read(run)
-    assert (description.label, description.steps) == ("no_lidar+size", 2)
-    assert description.config["loss.mean_color.weight"] == 0.1
-
-
-@pytest.mark.slow
-def test_a_number_of_a_finished_run(run, tiny_street):
-    root = next(word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
-    errors = largest_errors(run, DriveStudioReader(root).read())
-    held_out = read_views(run / "views.json").held_out
-    assert set(errors) == {(view.frame_index, view.camera_index) for view in held_out}
-    # Two steps from gray: somewhere a channel is far off, and none can be off by more than 1.
-    assert all(0.2 < error <= 1 for error in errors.values())
-
-
 def test_a_reader(tmp_path, capsys):
     words = [OUTSIDE, "data=pictures", "data.log.focal=20", f"data.root={tmp_path}", "split.stride=0"]
     assert data(["check", *words]) == 1
@@ -223,3 +181,84 @@ def test_a_reader(tmp_path, capsys):
     (tmp_path / "001.png").write_bytes(b"torn")
     assert data(["check", *words]) == 1
     assert "cannot be decoded" in capsys.readouterr().out
+
+
+def test_its_gaussians_come_and_go_for_every_reason(run):
+    with (run / "records" / "counts.csv").open() as file:
+        reasons = {row["reason"] for row in csv.DictReader(file) if row["node"] == "bobbing"}
+    assert {"start", "densify", "mask", "pruning"} <= reasons
+    # Its learned parts have moved, its network too, which rested for the first quarter.
+    node = load_scene(run).scene.nodes["bobbing"]
+    assert isinstance(node, Bobbing)
+    assert node.lift[0].get_parameter("weight").abs().sum() > 0
+    assert len(node.rows) >= node.settings.min_gaussians
+
+
+def test_the_scene_opens_and_shows_what_the_run_showed(run):
+    stored = load_scene(run)
+    node = stored.scene.nodes["bobbing"]
+    assert len(node.instances().names) > 0
+    assert len(node.instances().ids) == len(node.rows)
+    view = read_views(run / "views.json").held_out[0]
+    image = (stored.render(view).rgb.clamp(0, 1) * 255).round().byte()
+    assert np.array_equal(image.numpy(), np.asarray(Image.open(run / "pictures" / "005_0_render.png")))
+    without = stored.scene.without("gain")
+    assert list(without.effects) == ["sky"]
+    assert without.effects["sky"] is stored.scene.effects["sky"]
+
+
+def test_its_regularizer_is_among_the_terms_of_the_loss(run):
+    with (run / "curves" / "metrics.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row.get("train/bobbing/stillness")]
+    assert float(rows[0]["train/bobbing/stillness"]) > 0
+
+
+def test_it_is_trained_with_its_regularizer(run):
+    gain = load_scene(run).scene.effects["gain"]
+    assert isinstance(gain, Gain)
+    # Two cameras, and steps of about the learning rate.
+    assert gain.log_gains.shape == (2,)
+    assert 0.005 < gain.log_gains.abs().max() < 0.01 * STEPS
+    with (run / "curves" / "metrics.csv").open() as file:
+        terms = [float(row["train/gain/evenness"]) for row in csv.DictReader(file) if row.get("train/gain/evenness")]
+    assert max(terms) > 0
+
+
+def test_it_is_timed_counted_and_reported(run, capsys):
+    costs, summary = COSTS.read(run), SUMMARY.read(run)
+    assert set(costs.effects) == {"sky", "gain"}
+    assert {"sky", "gain"} <= set(costs.frame_ms) & set(costs.step_ms)
+    assert summary.bytes_by_part["gain"] == 2 * 4
+    description = RUN.read(run)
+    assert (description.label, description.steps) == ("streetgs+size", STEPS)
+    assert description.config["loss.mean_color.weight"] == 0.1
+    assert report([str(run)]) == 0
+    said = capsys.readouterr().out
+    assert "streetgs+size" in said
+    assert "bobbing" in said
+
+
+@pytest.mark.slow
+def test_commands_open_it_where_its_module_is_trusted(run, tmp_path, capsys):
+    """A run may come from anybody; the user's own command says whose code may run."""
+    run = shutil.copytree(run, tmp_path / "run")
+    commands = [
+        (evaluate, [str(run)], 1),
+        (render, [str(run), str(tmp_path / "still"), "frames=0:1", "device=cpu"], 1),
+        (train, [f"resume={run}", f"hydra.searchpath=[file://{ROOT}/tests/cli/toy/conf]"], 2),
+    ]
+    for command, words, status in commands:
+        assert command(words) == status
+        said = "effects.gain._target_ names 'tests.cli.toy.gain.GainSettings', which conf/ does not: say parts=[tests"
+        assert said in capsys.readouterr().err
+    for command, words, _ in commands:
+        assert command([*words, "parts=[tests.cli.toy]"]) == 0
+
+
+def test_a_number_of_a_finished_run(run, tiny_street):
+    root = next(word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
+    errors = largest_errors(run, DriveStudioReader(root).read())
+    held_out = read_views(run / "views.json").held_out
+    assert set(errors) == {(view.frame_index, view.camera_index) for view in held_out}
+    # A short run is far off somewhere, and nothing can be off by more than 1.
+    assert all(0.2 < error <= 1 for error in errors.values())

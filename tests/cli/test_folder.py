@@ -1,22 +1,25 @@
 """Whose folder a run writes into: nobody else's unless asked, and none for a start that fails."""
 
 import math
-import os
 import shutil
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import composed, resolved
 from sparsestreet.cli.runs import folder
-from sparsestreet.cli.runs.folder import OF_A_RUN, folder_problem, leave_folder, start_of, take_folder
+from sparsestreet.cli.runs.folder import (
+    OF_A_RUN,
+    folder_problem,
+    leave_folder,
+    resumed_overrides,
+    start_of,
+    take_folder,
+)
 from sparsestreet.cli.runs.locks import sole_writer
-from sparsestreet.cli.runs.resume import resumed_overrides
 from sparsestreet.cli.runs.sweep import run_job
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.extra import ExtraMetrics
@@ -71,16 +74,6 @@ def test_a_run_that_was_ended_before_its_first_checkpoint_begins_again(tmp_path,
     assert "ended before its first checkpoint: it begins again" in caplog.text
 
 
-def test_a_run_that_is_led_elsewhere_goes_on_there(tmp_path):
-    """The same words again: what the second folder has by now is further than what it came from."""
-    run, led = a_run(tmp_path / "run", steps=23), tmp_path / "led"
-    cfg = composed([f"resume={run}"])
-    assert start_of(cfg, led) == run
-    a_run(led, steps=None)
-    assert start_of(cfg, led) == led
-    assert start_of(cfg, run) == run
-
-
 def test_a_drive_is_the_same_by_another_path(tmp_path, monkeypatch):
     """A configuration is read back with whole paths."""
     monkeypatch.chdir(tmp_path)
@@ -89,12 +82,6 @@ def test_a_drive_is_the_same_by_another_path(tmp_path, monkeypatch):
     OmegaConf.save({"hydra": {"runtime": {"cwd": str(tmp_path)}}}, "run/.hydra/hydra.yaml")
     assert start_of(composed(words), Path("run")) == Path("run")
     assert "holds another run" in there(folder_problem(composed([words[0], "data.root=drives/2"]), Path("run")))
-
-
-def test_a_configuration_that_was_torn_is_another_run(tmp_path):
-    out = a_run(tmp_path / "run", steps=None)
-    (out / ".hydra/config.yaml").write_text('name: "str')
-    assert "holds another run" in there(folder_problem(composed(()), out))
 
 
 def contents(out: Path) -> dict[Path, int]:
@@ -129,61 +116,6 @@ def test_a_run_goes_on_in_its_own_folder_and_in_no_other_runs(tmp_path):
     assert "overwrite=true" not in resumed_overrides([f"resume={tmp_path / 'asked'}"])  # it would lose its checkpoints
 
 
-def test_a_run_without_a_checkpoint_is_said_at_once(tmp_path, capsys):
-    out = a_run(tmp_path / "run", steps=None)
-    (out / "checkpoints/last.ckpt").rename(out / "checkpoints/.last.99.tmp.ckpt")  # killed while it wrote the first
-    assert train([f"resume={out}"]) == 2
-    assert f"start it again with its own options and out={out}" in capsys.readouterr().err
-
-
-def test_what_is_no_run_is_no_obstacle(tmp_path):
-    (tmp_path / "notes.txt").touch()
-    (tmp_path / ".hydra").mkdir()  # of a start that failed
-    (tmp_path / "train.log").touch()
-    assert folder_problem(composed(()), tmp_path) is None
-    assert folder_problem(composed(()), tmp_path / "new/folder") is None
-
-
-def test_a_place_that_cannot_be_written_is_said_at_once(tmp_path, monkeypatch):
-    (tmp_path / "file").touch()
-    for out in (tmp_path / "file", tmp_path / "file/run"):
-        problem = f"{out} cannot be written (Not a directory): name another place with out=..."
-        assert folder_problem(composed(()), out) == problem
-    assert folder_problem(composed(()), tmp_path / "deep/er/run") is None
-    mkdir = Path.mkdir
-
-    def refused(folder: Path, **options: Any) -> None:  # root may write anywhere
-        if folder.name == "run":
-            raise PermissionError(13, "Permission denied")
-        mkdir(folder, **options)
-
-    monkeypatch.setattr(Path, "mkdir", refused)
-    assert "cannot be written (Permission denied)" in there(folder_problem(composed(()), tmp_path / "deep/run"))
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_refused_run_is_left_as_it_is(tmp_path, capsys):
-    out = a_run(tmp_path / "run")
-    before = contents(out)
-    assert train(["sparsify=paper", f"out={out}"]) == 2
-    written = capsys.readouterr().err
-    assert "holds another run (streetgs, seed 0)" in written
-    assert written.count("\n") == 1
-    assert contents(out) == before
-
-
-def test_hydra_leads_nowhere_else(tmp_path, capsys, monkeypatch):
-    """``hydra.run.dir`` names the folder behind the back of ``out``."""
-    out = a_run(tmp_path / "run")
-    monkeypatch.setattr(
-        "sparsestreet.cli.commands.train._problem_of_values", lambda words: None
-    )  # half of the test's time
-    with pytest.raises(SystemExit):
-        train(["sparsify=paper", f"hydra.run.dir={out}"])
-    assert "holds another run" in capsys.readouterr().err
-    assert (out / ".hydra/overrides.yaml").read_text() == "[]\n"
-
-
 def test_a_job_of_a_sweep_replaces_itself_alone(tmp_path, capsys):
     out = a_run(tmp_path / "run", steps=23)
     assert run_job(composed(()), out, lambda: 25.0) == 25.0  # unfinished: the same command runs it again
@@ -194,19 +126,6 @@ def test_a_job_of_a_sweep_replaces_itself_alone(tmp_path, capsys):
     assert "holds another run (streetgs, seed 0)" in capsys.readouterr().err
     assert contents(out) == before  # no failed.json either, which would take the record out of reports
     assert run_job(composed(["sparsify=paper", "overwrite=true"]), out, lambda: 26.0) == 26.0
-
-
-def test_two_runs_in_one_folder(tmp_path, capsys):
-    """The second is told at once, before it reads anything; what the first has written by then stays."""
-    out = tmp_path / "run"
-    with sole_writer(out):
-        with pytest.raises(SystemExit) as ended:
-            train([f"out={out}"])
-        assert ended.value.code == 1
-        assert (out / ".lock").exists()
-    said = capsys.readouterr().err.splitlines()
-    assert len(said) == 1
-    assert said[0].startswith(f"sparsestreet train: {out} is being written by process {os.getpid()} on ")
 
 
 def test_a_job_that_another_process_is_at_is_left_to_it(tmp_path, caplog):
@@ -272,14 +191,6 @@ def test_nothing_is_written_or_removed_through_a_link(name, tmp_path, capsys):
         evaluate(scene, options, data, out, device=torch.device("cpu"), command="", extra=ExtraMetrics())
     assert contents(victim) == before
     assert (out / "checkpoints/last.ckpt").is_file()
-
-
-@pytest.mark.usefixtures("within_hydra")
-def test_a_run_that_goes_on_keeps_its_files(tmp_path):
-    out = a_run(tmp_path / "run", steps=23)
-    take_folder(composed([f"resume={out}"]), out, goes_on=True)
-    assert (out / "checkpoints/last.ckpt").is_file()
-    assert RUN.read(out).steps == 23
 
 
 @pytest.mark.usefixtures("within_hydra")

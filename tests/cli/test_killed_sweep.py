@@ -1,10 +1,11 @@
-"""A sweep that is killed, whatever it was doing, ends with the records of one that nobody disturbed."""
+"""A run or a sweep that is killed, whatever it was doing, ends with the records of one that nobody disturbed."""
 
 import csv
 import hashlib
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,9 @@ from typing import Any
 
 import pytest
 
-from tests.cli.conftest import TIMED_ONCE
+from sparsestreet.cli.commands.train import train
+from sparsestreet.training.callbacks import RowLedger
+from tests.cli.conftest import TIMED_ONCE, TINY_RIGID
 
 KILLS = 5
 JOBS = 12
@@ -114,3 +117,57 @@ def test_a_sweep_that_a_signal_ends_leaves_no_process_behind(tiny_street, tmp_pa
             os.killpg(process.pid, 0)
             time.sleep(0.1)
     assert not list(tmp_path.glob("*/records/summary.json"))
+
+
+EPOCH = 22
+"""Training images of the street: the sixth validation lies at the end of an epoch."""
+KILLED_AFTER = {
+    "before the first checkpoint": 1,
+    "behind a validation and the checkpoint of its step": 4,
+    "a step later": 5,
+    "where curves were logged since": 10,
+    "at the end of an epoch": EPOCH,
+    "in the next one": EPOCH + 3,
+}
+"""Name -> steps that were done."""
+
+
+@pytest.fixture(scope="module")
+def command(tiny_street) -> list[str]:
+    short = [
+        "schedule.max_steps=30",
+        "trainer.val_check_interval=2",
+        "checkpoint_every=2",
+        "trainer.log_every_n_steps=3",
+    ]
+    return [*tiny_street, *TINY_RIGID, *short]
+
+
+@pytest.fixture(scope="module")
+def left(command, tmp_path_factory) -> Path:
+    """A run, and what a kill would have left of it: copies of its folder as it was between two steps."""
+    folder = tmp_path_factory.mktemp("killed")
+
+    def copy(self, trainer, *arguments):
+        if trainer.global_step in KILLED_AFTER.values():
+            shutil.copytree(
+                folder / "whole", folder / f"after{trainer.global_step}", ignore=shutil.ignore_patterns(".lock")
+            )
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RowLedger, "on_train_batch_start", copy, raising=False)
+        assert train([*command, f"out={folder / 'whole'}"]) == 0
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", KILLED_AFTER.values(), ids=KILLED_AFTER)
+def test_a_killed_run_ends_with_the_records_of_a_whole_one(command, left, steps):
+    out = left / f"after{steps}"
+    begun = (out / "checkpoints").exists()
+    assert begun == (steps > 1)
+    assert train([*command, f"out={out}"]) == 0
+    assert ("goes on from its newest checkpoint" in (out / "train.log").read_text()) == begun
+    expected, got = content(left / "whole"), content(out)
+    assert sorted(expected) == sorted(got)
+    assert [name for name in expected if expected[name] != got[name]] == []

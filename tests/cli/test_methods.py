@@ -2,30 +2,25 @@
 
 import csv
 import itertools
-from dataclasses import replace
-from functools import cache
 from typing import Any
 
 import pytest
 import torch
 from hydra.errors import InstantiationException
-from omegaconf import OmegaConf
+from hydra.utils import instantiate
 
-from sparsestreet.cli.config.assemble import recipe_of
-from sparsestreet.cli.config.compose import resolved
-from sparsestreet.cli.config.option_files import option_tree, options_of
+from sparsestreet.cli.config.compose import option_tree, options_of, resolved
 from sparsestreet.cli.config.validate import config_problem, override_problem
+from sparsestreet.cli.runs.run import recipe_of
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.records.configuration import flat_config
-from sparsestreet.scene.density import GradientDensity, VibratingDensity
-from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.sources import ImagePoints
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.masks import SampledMaskSettings, StaticMaskSettings
+from sparsestreet.scene.masks import SampledMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.training.losses import MaskSparsity
-from sparsestreet.triangulation import ImagePointSettings
+from sparsestreet.training.parallel import DataParallel
 from tests.cli.configurations import composed
 from tests.typed import as_a, there
 
@@ -40,17 +35,6 @@ paper takes part in test_toy_node.py."""
 EXPERIMENTS = options_of("experiment")
 
 
-def test_the_options_that_tables_need_are_there():
-    assert {"3dgs", "streetgs"} <= set(METHODS)
-    assert {"none", "masks", "importance", "paper", "paper_short", "removal", "random", "opacity"} <= set(SPARSIFY)
-    assert {"capped", "mcmc", "uncapped", "maskgaussian"} <= set(SPARSIFY)
-
-
-@cache
-def plain_losses(method: str) -> list[str]:
-    return list(recipe_of(composed(f"method={method}")).losses)
-
-
 @pytest.mark.parametrize(
     ("method", "sparsify"),
     [pair if pair in COMPOSED else pytest.param(*pair, marks=pytest.mark.slow) for pair in PAIRS],
@@ -61,7 +45,10 @@ def test_every_pair_composes_and_its_parts_agree(method: str, sparsify: str):
     recipe = recipe_of(cfg)
     masked = cfg.sparsify.masks
     assert all((settings.mask_settings is not None) == masked for settings in recipe.nodes.values())
-    assert list(recipe.losses) == [*plain_losses(method), *(["mask_sparsity"] if masked else [])]
+    assert list(recipe.losses) == [
+        *recipe_of(composed(f"method={method}")).losses,
+        *(["mask_sparsity"] if masked else []),
+    ]
     # Which rule and which masks a sparsification has is the paper's matter, and that of its name.
     rules = dict.fromkeys(("importance", "paper", "paper_short"), ImportanceRule)
     rules |= {"removal": LeaveOneOutRule, "random": RandomRule, "opacity": OpacityRule}
@@ -87,16 +74,6 @@ def test_every_experiment_composes(experiment: str, method: str):
     recipe_of(composed(f"experiment={experiment}", f"method={method}"))
 
 
-@pytest.mark.parametrize("schedule", ["short", "paper"])
-@pytest.mark.parametrize("capacity", ["small", "paper"])
-def test_schedules_and_capacities(schedule: str, capacity: str):
-    recipe = recipe_of(composed(f"schedule={schedule}", f"capacity={capacity}", "sparsify=paper"))
-    expected = (40_000, 130_000, 10_000, 8000) if capacity == "small" else (40_000, None, 10_000, None)
-    background, rigid = recipe.nodes["background"], recipe.nodes["rigid"]
-    limits = (background.min_gaussians, background.max_gaussians, rigid.min_gaussians, rigid.max_gaussians)
-    assert limits == expected
-
-
 def papers_numbers(capacity: str, schedule: str) -> dict[str, Any]:
     """What sparsify=paper says of masks and pruning, with every node that the paper has."""
     cfg = composed("method=omnire", "sparsify=paper", f"schedule={schedule}", f"capacity={capacity}")
@@ -120,8 +97,7 @@ def papers_numbers(capacity: str, schedule: str) -> dict[str, Any]:
     }
 
 
-@pytest.mark.parametrize("capacity", ["paper", "small"])
-@pytest.mark.parametrize("schedule", ["short", "paper"])
+@pytest.mark.parametrize(("capacity", "schedule"), [("paper", "paper"), ("small", "short")])
 def test_the_papers_method_has_its_numbers_at_any_length(schedule: str, capacity: str):
     """Those of its text: steps 24,000 and 28,000 of 30,000 as fractions, lambda_n, K_min. lambda_m, epsilon and the
     rate, which it leaves open, as stated in conf."""
@@ -154,35 +130,6 @@ def test_the_short_variant_is_the_schedules():
     assert short == exact
 
 
-def test_a_preset_reaches_the_density_of_every_node():
-    nodes = recipe_of(composed("preset=drivestudio")).nodes.values()
-    assert [as_a(GradientDensity, settings.density).grad_threshold for settings in nodes] == [5e-4, 5e-4]
-
-
-def test_before_removal_masks_are_pushed_by_a_weight_of_their_own():
-    """In a short run less than masks alone (conf/schedule/short.yaml says why)."""
-    cfg = composed("sparsify=removal")
-    weight = as_a(MaskSparsity, recipe_of(cfg).losses["mask_sparsity"]).weight
-    assert weight == cfg.schedule.removal_lambda_m < cfg.schedule.lambda_m
-
-
-def test_k_min_has_one_home():
-    cfg = composed("sparsify=paper", "node.background.min_gaussians=2000")
-    text = OmegaConf.to_yaml(cfg, resolve=True)
-    assert "min_gaussians: 2000" in text
-    assert text.count("min_gaussians: 40000") == 1  # of the capacity
-    settings = recipe_of(cfg).nodes["background"]
-    assert settings.min_gaussians == 2000
-    assert as_a(StaticMaskSettings, settings.mask_settings).build(settings.min_gaussians).min_gaussians == 2000
-
-
-def test_the_shares_of_the_sources_are_all_points():
-    """Whatever the images show: what one source is not asked for, another is."""
-    sources = as_a(BackgroundSettings, recipe_of(composed()).nodes["background"]).sources.values()
-    for seen in (Coverage(0.5, 0.3), Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0)):
-        assert sum(source.share(seen) for source in sources) == pytest.approx(1)
-
-
 def test_sources_are_chosen_left_out_and_refused():
     chosen = recipe_of(composed("source@node.background.sources=[lidar,far]")).nodes["background"]
     assert list(as_a(BackgroundSettings, chosen).sources) == ["lidar", "far"]
@@ -194,56 +141,17 @@ def test_sources_are_chosen_left_out_and_refused():
         recipe_of(composed("node.background.sources.far=null"))
 
 
-def test_points_from_images_are_made_unless_told_otherwise():
-    assert isinstance(recipe_of(composed()).image_points, ImagePointSettings)
-    assert recipe_of(composed("image_points=none")).image_points is None
-
-
-@pytest.mark.parametrize("rule", options_of("pruning"))
-def test_rules_are_chosen_by_name_wherever_something_is_pruned(rule: str):
-    pruning = composed("sparsify=paper", f"pruning@callback.pruning.rule={rule}").callback.pruning
-    assert OmegaConf.to_container(pruning.rule, resolve=False) == option_tree("pruning", rule)
-    assert pruning.at == [0.93334]
-
-
-def test_a_density_strategy_is_a_choice():
-    """A node says what differs, whichever it is; the strategy of PVG has the period of the node it is chosen for."""
-    vibrating = recipe_of(composed("method=pvg", "node.background.cycle=0.3")).nodes["background"].density
-    pvg = as_a(VibratingDensity, vibrating)
-    assert (pvg.cycle, pvg.cull_scale) == (0.3, 0.5)
-    other = recipe_of(composed("method=pvg", "density@node.background.density=gradient")).nodes["background"].density
-    assert other == GradientDensity()
-    cars = as_a(GradientDensity, recipe_of(composed()).nodes["rigid"].density)
-    assert (cars.cull_scale, cars.split_scale) == (0.1, 0.003)
-
-
 @pytest.mark.parametrize(
     ("overrides", "asked"),
     [
         ([], {"rigid": (1.0, 0.0), "deformable": (0.5, 0.0), "smpl": (None, 0.0)}),
-        (["moving=path_length"], {"rigid": (None, 1.0), "deformable": (None, 0.5), "smpl": (None, 0.5)}),
-        (["preset=drivestudio_legacy"], {"rigid": (None, 1.0), "deformable": (None, 0.5), "smpl": (None, 0.5)}),
         (["preset=drivestudio"], {"rigid": (None, 1.0), "deformable": (None, 0.5), "smpl": (None, 0.5)}),
-        (
-            ["preset=drivestudio", "moving=displacement"],
-            {"rigid": (1.0, 0.0), "deformable": (0.5, 0.0), "smpl": (None, 0.0)},
-        ),
         (["moving.rigid.min_displacement=2.0"], {"rigid": (2.0, 0.0), "deformable": (0.5, 0.0), "smpl": (None, 0.0)}),
     ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_what_moves_is_one_choice_and_upstreams_presets_make_it(overrides, asked):
     nodes = recipe_of(composed("method=omnire", *overrides)).nodes
     assert {name: (nodes[name].min_displacement, nodes[name].min_path_length) for name in asked} == asked
-
-
-def test_pvg_grows_by_upstreams_numbers_at_the_papers_length():
-    """But for the screen gradients, which are absolute ones here, and so have a threshold of their own."""
-    node = recipe_of(composed("method=pvg", "schedule=paper", "capacity=paper")).nodes["background"]
-    density = as_a(VibratingDensity, node.density)
-    assert (density.peak_threshold, density.split_span, density.split_scale) == (2e-3, 0.01, 0.01)
-    assert (density.cull_scale, density.split_children, density.split_shrink) == (0.5, 2, 1.6)
-    assert node.max_gaussians == 3_000_000
 
 
 def test_settings_of_the_op_are_those_of_a_preset_unless_given():
@@ -286,37 +194,14 @@ def test_settings_of_the_op_are_those_of_a_preset_unless_given():
             "effects.sky.when=off",
             "logger=none",
         ],
-        ["source@node.background.sources=[lidar,far]", "effects=[sky]"],
-        ["effects=[]"],
+        ["source@node.background.sources=[lidar,far]", "effects=[]"],
     ],
-    ids=["values", "choices", "some of several", "none of several"],
+    ids=["values", "choices", "some of several"],
 )
 def test_every_option_can_be_set_without_plus_signs(overrides: list[str]):
     """What does not fit names its key."""
     assert override_problem(["sparsify=paper", *overrides]) is None
     recipe_of(composed("sparsify=paper", *overrides))
-
-
-@pytest.mark.parametrize(
-    ("overrides", "said"),
-    [
-        (["sparsify=masks", "~loss.mask_sparsity"], "no MaskSparsity among the losses"),
-        (["sparsify=masks", "~callback.mask_training"], "no MaskTraining among the callbacks"),
-        (["sparsify=masks", "sparsify.masks=false"], "no node trains a mask"),
-        (["sparsify=importance", "node.background.prunable=false"], "may touch no node"),
-        (["node.background.density=null", "node.rigid.density=null"], "every node's density is null"),
-    ],
-)
-def test_a_part_without_its_counterpart_is_an_error(overrides: list[str], said: str):
-    with pytest.raises(ValueError, match=said):
-        recipe_of(composed(*overrides))
-
-
-def test_a_node_and_an_effect_of_one_name_are_an_error():
-    recipe = recipe_of(composed())
-    assert recipe.problems() == []
-    shared = replace(recipe, effects={"background": recipe.effects["sky"]})
-    assert shared.problems() == ["a node and an effect are both named background: rename one of them"]
 
 
 @pytest.mark.parametrize(
@@ -342,6 +227,7 @@ def test_every_pair_trains_and_each_of_its_events_fires(method: str, sparsify: s
         *(["node.background.density.grad_threshold=1e-6"] if sparsify != "mcmc" else []),
         *(masks if masked else []),
         *(["image_points=none"] if method == "3dgs" else []),
+        *(BASELINE_TERMS if method == "omnire" else []),
     )
     with (out / "records" / "counts.csv").open() as file:
         reasons = {row["reason"] for row in csv.DictReader(file)}
@@ -375,12 +261,7 @@ def test_the_terms_of_the_baselines_are_options():
     assert not losses["depth"].inverse
 
 
-def test_the_terms_of_the_baselines_train_and_a_control_prunes_every_node(run_train, tmp_path):
-    """All terms in one run, the dynamic region in its last third, and pruning to given numbers."""
-    counts = "callback.pruning.rule.keep={background: 500, rigid: 0.5}"
-    out = run_train(tmp_path, *BASELINE_TERMS, "sparsify=random", counts, "trainer.fast_dev_run=6")
-    with (out / "records" / "counts.csv").open() as file:
-        pruned = {row["node"]: row for row in csv.DictReader(file) if row["reason"] == "pruning"}
-    assert pruned["background"]["after"] == "500"
-    # Objects have floors of their own.
-    assert 0.5 * int(pruned["rigid"]["before"]) <= int(pruned["rigid"]["after"]) < int(pruned["rigid"]["before"])
+def test_several_processes_are_an_option():
+    cfg = composed("trainer=ddp", "trainer.devices=2")
+    assert type(instantiate(cfg.trainer.strategy)) is DataParallel
+    assert (cfg.trainer.devices, cfg.trainer.accelerator, cfg.optimizer.batch_rule) == (2, "auto", "sqrt")

@@ -6,7 +6,7 @@ from typing import Literal
 
 import pytest
 
-from sparsestreet.cli.commands.options import OptionError, parse_options, run_command, unknown_key
+from sparsestreet.cli.commands.options import OptionError, parse_options, run_command
 
 
 @dataclass(frozen=True)
@@ -40,16 +40,6 @@ def test_every_kind_of_value_is_read():
         Path("a=b/run"), 12, 29.97, True, (0, 2), ("background",), slice(3, 40), "shifted", "two words", "cuda"
     )
     assert parse_options(words, Wishes) == expected
-
-
-def test_what_is_not_said_keeps_its_default():
-    assert parse_options(["scene=run"], Wishes) == Wishes(Path("run"))
-
-
-def test_brackets_may_be_left_out_and_ranges_are_open():
-    assert parse_options(["scene=r", "cameras=0, 2", "frames=:5"], Wishes).cameras == (0, 2)
-    assert parse_options(["scene=r", "frames=5:"], Wishes).frames == slice(5, None)
-    assert parse_options(["scene=~/r"], Wishes).scene == Path.home() / "r"
 
 
 @pytest.mark.parametrize(
@@ -101,17 +91,6 @@ def test_a_few_fields_take_a_word_each(words, tmp_path, monkeypatch):
     assert parse_options(words, Wishes, positional=("scene", "title")) == Wishes(Path("a=b/run"), title="two words")
 
 
-@pytest.mark.parametrize("words", [["r", "t", "more"], ["r", "scene=q", "t"], ["r", "--width=5"]])
-def test_a_word_too_many_is_no_option(words):
-    with pytest.raises(OptionError, match="is no option: write key=value, with one of scene, width"):
-        parse_options(words, Wishes, positional=("scene", "title"))
-
-
-def test_very_many_keys_are_not_listed():
-    assert unknown_key("zz", ["width", "height"]) == "no key 'zz'; there are width, height"
-    assert unknown_key("zz", [f"key_{number}" for number in range(100)]) == "no key 'zz'"
-
-
 def _fail(error: BaseException):
     def act(wishes: Wishes) -> None:
         raise error
@@ -133,25 +112,7 @@ def test_what_an_action_meets_is_one_line_and_a_status(error, status, said, caps
     assert capsys.readouterr().err == said
 
 
-def test_a_bug_is_no_message():
-    with pytest.raises(TypeError):
-        run_command("film", "USAGE", ["scene=r"], Wishes, _fail(TypeError("a bug")))
-
-
 @pytest.mark.parametrize(("words", "status"), [(["--help"], 0), (["scene=r", "-h"], 0), ([], 2)])
 def test_usage_is_shown_without_acting(words, status, capsys):
     assert run_command("film", "USAGE", words, Wishes, _fail(TypeError("acted"))) == status
     assert capsys.readouterr().out == "USAGE\n"
-
-
-def test_an_action_gets_the_options():
-    seen = []
-    assert run_command("film", "USAGE", ["scene=r"], Wishes, seen.append) == 0
-    assert seen == [Wishes(Path("r"))]
-
-
-def test_what_is_missing_comes_with_the_form_of_the_command(capsys):
-    usage = "sparsestreet shows RUN FILE [key=value ...]     what was seen\n\n  scene   a run"
-    assert run_command("shows", usage, ["width=5"], Wishes, print) == 2
-    said = "sparsestreet shows: scene=... is missing: sparsestreet shows RUN FILE [key=value ...]\n"
-    assert capsys.readouterr().err == said

@@ -1,4 +1,4 @@
-"""What the pages show is what a reader types: commands are understood (and run: test_pages_run.py), and Python runs."""
+"""What the pages show is what a reader types: commands are understood, and Python runs."""
 
 import importlib
 import re
@@ -6,6 +6,7 @@ import shlex
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
@@ -20,6 +21,8 @@ from tests.test_docs import PAGES, ROOT
 
 STAND_INS = {"data=auto": "data=drivestudio", "data=NAME": "data=drivestudio"}
 """The command itself finds the reader of a folder."""
+DAILY = ("README.md", "train.md", "gpu.md")
+"""Pages whose commands a daily run parses; the others repeat most of them."""
 OF_HYDRA = ("train", "jobs", "effects", "demo", "data")
 
 
@@ -69,8 +72,11 @@ def _bench_problem(module: ModuleType, words: list[str], patch: pytest.MonkeyPat
     return None
 
 
-@pytest.mark.lengthy
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "page",
+    [page if page.name in DAILY else pytest.param(page, marks=pytest.mark.slow) for page in PAGES],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
+)
 def test_every_command_is_understood(page):
     problems = {command: problem_of(command) for command in commands_of(page)}
     assert {command: problem for command, problem in problems.items() if problem is not None} == {}
@@ -80,26 +86,6 @@ def test_every_target_of_make_is_there():
     targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), flags=re.M)
     named = {name for page in PAGES for name in re.findall(r"(?:^|`)make ([\w-]+)", page.read_text(), flags=re.M)}
     assert named <= set(targets)
-
-
-def test_commands_are_found_and_slips_too(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "In a `sparsestreet view\nRUN` sentence.\n\n"
-        "```\n.venv/bin/sparsestreet render RUN a.mp4 \\\n    fsp=3  # note\n"
-        "sparsestreet bench [knobs] [--street RUN]   words\nsparsestreet bench kobs\n```\n\n```yaml\nmove: {}\n```\n\n"
-        "```\nsparsestreet train shedule.max_steps=3\nsrun -N2 sparsestreet look\n```\n"
-    )
-    found = {command: problem_of(command) for command in commands_of(page)}
-    assert found.pop("sparsestreet view RUN") is None
-    assert found.pop("sparsestreet bench") is None
-    assert list(found) == [
-        "sparsestreet render RUN a.mp4 fsp=3",
-        "sparsestreet bench kobs",
-        "sparsestreet train shedule.max_steps=3",
-        "sparsestreet look",
-    ]
-    assert all(found.values())
 
 
 def test_what_does_not_run_in_the_test_of_all_commands_has_a_test_of_its_own():
@@ -151,3 +137,24 @@ def test_messages_of_the_page_on_troubleshooting_are_those_of_the_program():
     for message in messages:
         for part in re.split(r"\b(?:NAME|N)\b", message):
             assert part.strip(" ;,:") in source, message
+
+
+README = (Path(__file__).parents[2] / "README.md").read_text()
+
+
+@pytest.mark.filterwarnings("ignore:The number of training batches")
+def test_the_lines_of_python_train_a_street_and_render_it(tiny_street, tmp_path, monkeypatch):
+    """On the street of the other tests, since tracing one takes seconds."""
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
+    assert sum(bool(line) for line in code.splitlines()) == 12
+    (root,) = (word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
+    code, streets = re.subn(r"StreetReader\(StreetSettings\(.*?\)\)", f"DriveStudioReader({root!r})", code)
+    code, trainings = re.subn("max_steps=200", "max_steps=5", code)
+    assert (streets, trainings) == (1, 1)
+    names: dict[str, Any] = {"DriveStudioReader": DriveStudioReader}
+    with unchecked():
+        exec(code, names)
+    assert names["image"].shape == (40, 64, 3)
+    assert 0 < float(names["image"].mean()) < 1
+    assert (tmp_path / "mine" / "scene.safetensors").is_file()

@@ -1,19 +1,19 @@
-"""The presets that are DriveStudio's (at e59bda4): how they compose, and what none of its keys says."""
+"""The presets that are DriveStudio's (at e59bda4): how they compose, and the table beside its settings."""
 
+import ast
 import itertools
 from typing import Any
 
 import pytest
 
-from sparsestreet.cli.commands.presets import pairs, rows_of
-from sparsestreet.cli.config.assemble import recipe_of
-from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.commands.presets import SAID, WIDTH, lines, overview, pairs, presets, rows_of
+from sparsestreet.cli.config.compose import CONF, resolved
 from sparsestreet.cli.config.validate import config_problem, preset_notes
+from sparsestreet.cli.runs.run import recipe_of
 from sparsestreet.records.configuration import flat_config
-from sparsestreet.training.callbacks import DensityControl, Pruning
-from sparsestreet.training.schedule import Course, Interval, milestone
+from sparsestreet.training.callbacks import DensityControl
+from sparsestreet.training.schedule import Course, Interval
 from tests.cli.configurations import composed
-from tests.cli.test_upstream import alternatives
 from tests.typed import as_a
 
 FULL = ("schedule=paper", "capacity=paper")
@@ -230,12 +230,10 @@ def test_a_method_without_a_configuration_is_refused_in_one_line():
         )
 
 
-@pytest.mark.parametrize(("capacity", "schedule"), [*itertools.product(["small", "paper"], ["short", "paper"])])
-def test_only_the_full_size_has_the_name_of_upstream(capacity: str, schedule: str):
-    cfg = composed("preset=drivestudio", "method=pvg", f"schedule={schedule}", f"capacity={capacity}")
-    whole = (capacity, schedule) == ("paper", "paper")
-    assert cfg.preset.label == ("-drivestudio" if whole else "-drivestudio_scaled")
-    assert any("is scaled" in note for note in preset_notes(cfg)) == (not whole)
+def test_only_the_full_size_has_the_name_of_upstream():
+    whole, short = (composed("preset=drivestudio", "method=pvg", *size) for size in (FULL, ()))
+    assert (whole.preset.label, short.preset.label) == ("-drivestudio", "-drivestudio_scaled")
+    assert [any("is scaled" in note for note in preset_notes(cfg)) for cfg in (whole, short)] == [False, True]
 
 
 def test_a_short_run_has_the_same_shape():
@@ -260,27 +258,6 @@ def test_resets_come_at_the_steps_of_upstream():
     assert not any(interval.due(step, Course(2_000)) for step in range(2_001))
 
 
-def test_the_papers_pruning_comes_900_steps_after_the_last_reset():
-    """Upstream resets to the end, whatever is pruned; docs/baselines.md says what that means for the pruning."""
-    callbacks = recipe_of(composed("preset=drivestudio", "method=3dgs", "sparsify=paper", *FULL)).callbacks
-    resets = as_a(DensityControl, callbacks["density_control"]).reset_in
-    (pruned,) = (milestone(fraction, Course(30_000)) for fraction in as_a(Pruning, callbacks["pruning"]).at)
-    assert pruned == 28_000
-    assert max(step for step in range(pruned + 1) if resets.due(step, Course(30_000))) == 27_100
-
-
-def test_what_is_lacking_is_said_in_plain_words():
-    cfg = composed("preset=drivestudio_legacy", "method=omnire", *FULL)
-    (note,) = preset_notes(cfg)
-    assert note.startswith("preset drivestudio_legacy lacks of DriveStudio: ")
-    assert "skinned" in note
-    assert "camera poses" not in note  # upstream's legacy has none
-    assert "camera poses are not refined" in next(preset_notes(composed("preset=drivestudio", "method=pvg", *FULL)))
-    assert list(preset_notes(composed())) == []
-    # The configuration of a run has it.
-    assert any(key.startswith("preset.absent.") for key in flat("drivestudio", "pvg"))
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("preset", "method"),
@@ -303,3 +280,60 @@ def test_a_preset_trains_and_says_what_it_is(preset: str, method: str, run_train
     said = capsys.readouterr().out
     assert said.count(f"preset {preset} is scaled: ") == 1
     assert said.count(f"preset {preset} lacks of DriveStudio: ") == 1
+
+
+def alternatives(ours: str) -> list[str]:
+    """``node.a|b.rate`` as the keys that it stands for."""
+    return [".".join(parts) for parts in itertools.product(*(part.split("|") for part in ours.split(".")))]
+
+
+def literal(cell: str) -> Any:
+    try:
+        return ast.literal_eval(cell)
+    except (ValueError, SyntaxError):
+        return cell
+
+
+@pytest.mark.parametrize(("preset", "method"), pairs())
+def test_our_values_are_those_that_the_preset_composes(preset: str, method: str):
+    cfg = composed(f"preset={preset}", f"method={method}", "schedule=paper", "capacity=paper")
+    flat: dict[str, Any] = dict(flat_config(resolved(cfg)))
+    lists = {key: value for key, value in flat.items() if isinstance(value, list)}
+    flat |= {f"{key}.{index}": item for key, items in lists.items() for index, item in enumerate(items)}
+    rows = rows_of(preset, method)
+    ours = [row for row in rows if row.ours != "-"]
+    assert len(ours) > 60
+    for row in ours:
+        found = [flat[key] for key in alternatives(row.ours)]
+        assert found == [literal(row.value)] * len(found), row.key
+    notes = [row.reason.removesuffix(SAID).strip() for row in rows if row.verdict == "said" or SAID in row.reason]
+    said = set(cfg.preset.absent.values())
+    assert said == {note for note in said if any(note in one for one in notes)}
+    assert all(any(note in one for note in said) for one in notes)
+
+
+@pytest.mark.parametrize(("preset", "method"), pairs())
+def test_every_key_has_one_row_and_every_difference_its_reason(preset: str, method: str):
+    rows = [row for row in rows_of(preset, method) if row.verdict != "said"]
+    assert len({row.key for row in rows}) == len(rows) > 100
+    assert all((row.verdict == "equal") == (row.reason == "") for row in rows)
+    assert all((row.verdict == "absent") == (row.ours == "-") for row in rows)
+    text = list(lines(rows_of(preset, method)))
+    assert max(map(len, "\n".join(text).splitlines())) <= WIDTH
+    assert sum(line.startswith(("equal ", "differs ", "absent ")) for line in text) == len(rows)
+
+
+def test_the_columns_stand_under_their_titles(capsys):
+    assert presets(["streetgs", "preset=drivestudio", "only=differs"]) == 0
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == "preset=drivestudio method=streetgs beside configs/streetgs.yaml of DriveStudio (e59bda4)"
+    title, row, reason = printed[printed.index("") + 1 :][:3]
+    assert title.split() == ["logging", "upstream", "here"]
+    assert row.split() == ["differs", "saveckpt_freq", "15000", "1000", "checkpoint_every"]
+    assert (title.index("upstream"), title.index("here")) == (row.index("15000"), row.index("1000 "))
+    assert reason.strip() == "how often a run says or keeps something"
+
+
+def test_the_page_has_the_counts_that_the_command_prints():
+    page = (CONF.parent / "docs" / "baselines.md").read_text()
+    assert "\n".join(overview()).partition("\n\n")[0] in page

@@ -1,30 +1,20 @@
 """``sparsestreet render`` on a hand-made scene; the run of a real training is rendered in test_train."""
 
-import json
 import re
 import shutil
-import subprocess
-import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hydra.utils import instantiate
 from PIL import Image
 
-from sparsestreet.cli.commands import scenes
-from sparsestreet.cli.commands.render import USAGE, RenderRequest, render
+from sparsestreet.cli.commands.render import render
 from sparsestreet.cli.config.compose import load_run_config
-from sparsestreet.export import video
-from sparsestreet.export.layers import LAYERS, count_images, layer_values
-from sparsestreet.export.path import cropped, pinholes, raised, recorded, resized, shifted
-from sparsestreet.geometry.cameras import inverse
-from sparsestreet.ops.cpu import rasterizer
-from sparsestreet.scene.edits import REMOVED, Edits, edited
+from sparsestreet.export.path import shifted
 from sparsestreet.scene.storage import save_scene
-from sparsestreet.scene.views import read_views, write_views
+from sparsestreet.scene.views import write_views
 from tests.export.street import stored_street, street_views
 from tests.typed import there
 
@@ -75,34 +65,6 @@ def test_a_shifted_path_is_seen_from_beside(run, tmp_path):
     assert not np.array_equal(shown[1][:, :48], rendered(stored, rig[0]))
 
 
-def test_a_change_of_lane_ends_beside_the_path(run, tmp_path):
-    for out, words in (("lane", ["path=lane_change"]), ("beside", ["path=shifted"]), ("on", [])):
-        offset = ["offset=1.5"] if words else []
-        assert render([f"scene={run}", f"out={tmp_path / out}", "cameras=0", *words, *offset]) == 0
-    lane, beside, on = (pictures(tmp_path / name) for name in ("lane", "beside", "on"))
-    assert np.array_equal(lane[0], on[0])
-    assert np.array_equal(lane[-1], beside[-1])
-
-
-def test_a_smooth_small_video(run, tmp_path):
-    words = [f"scene={run / 'scene.safetensors'}", f"out={tmp_path / 'a.mp4'}", "cameras=0", "width=24", "fps=30"]
-    assert render([*words, "log_fps=10", "quality=9", "device=cpu"]) == 0
-    from tests.export.test_video import read_video
-
-    fps, frames = read_video(tmp_path / "a.mp4")
-    assert (fps, frames.shape) == (30.0, (13, 16, 24, 3))
-
-
-def test_the_logs_own_rate_is_taken_where_it_is_known(run, tmp_path, capsys):
-    views = read_views(run / "views.json")
-    write_views(tmp_path / "others.json", views.training, views.held_out, frame_rate=4.0)
-    words = [f"scene={run}", f"out={tmp_path / 'a'}", "cameras=0", f"views={tmp_path / 'others.json'}"]
-    assert render(words) == 0
-    said = capsys.readouterr().out
-    assert "not known" not in said
-    assert "5 frames of camera 0 at 4 a second (the log's speed, 4 of its frames a second)" in said
-
-
 def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
     """Five frames, 0.1 s apart: each is shown for 0.1 s, whatever the frames a second of the video."""
     from tests.export.test_video import read_video
@@ -119,83 +81,6 @@ def test_a_video_lasts_as_long_as_the_drive(run, tmp_path, capsys):
     # From the first frame to the last, 0.4 s, in steps of 1/40 s, and the last one.
     assert (fps, len(frames)) == (40.0, 17)
     assert "at 40 a second (the log's speed, 10 of its frames a second)" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("change", "status", "said"),
-    [
-        ({"widht": 5}, 2, "did you mean 'width'?"),
-        ({"offset": 1}, 2, "needs both: path=shifted offset=METERS"),
-        ({"path": "shifted"}, 2, "needs both: path=shifted offset=METERS"),
-        ({"path": "circle"}, 2, "or a .json, got 'circle'"),
-        ({"path": "a.json", "frames": "0:2"}, 2, "frames= chooses of the log's"),
-        ({"path": "a.json"}, 1, "there is no path at a.json"),
-        ({"layers": "rgb,radar"}, 2, "layers are rgb, depth, alpha, nodes, instances, seen, lidar, each once"),
-        ({"layers": "rgb,lidar"}, 1, "the layer lidar needs the log that the scene was trained on"),
-        ({"layers": "rgb,rgb"}, 2, "each once, got rgb, rgb"),
-        ({"fov": 180}, 2, "fov lies between 0 and 180 degrees"),
-        ({"height": 0}, 2, "height must be above 0"),
-        ({"fps": 0}, 2, "fps must be above 0, got 0"),
-        ({"quality": 11}, 2, "quality lies in 1 to 10, got 11"),
-        ({"fps": 1e5}, 2, "fps lies in 0.001 to 1000, got 100000"),
-        ({"log_fps": 1e-5}, 2, "log_fps lies in 0.001 to 1000, got 1e-05"),
-        ({"quality": "nan"}, 2, "quality must be a number, got 'nan'"),
-        ({"width": 6000}, 1, "at most 16,384 pixels a side, got 24,000 x 4,000: take a smaller width="),
-        ({"out": "drive.avi"}, 2, "ends in .mp4"),
-        ({"scene": "nowhere"}, 1, "there is no scene at nowhere"),
-        ({"views": "nowhere.json"}, 1, "there is no nowhere.json: training writes"),
-        ({"cameras": 7}, 1, "no camera 7 in frame 0, only [0, 1, 2, 3]"),
-        ({"frames": "9:"}, 1, "the path has 0 to 4"),
-        ({"device": "tpu"}, 1, "device must be cpu or cuda, got 'tpu'"),
-    ],
-)
-def test_a_slip_is_one_line_and_leaves_nothing(run, tmp_path, change, status, said, capsys, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = {"scene": run, "out": "drive.mp4"} | change
-    assert render([f"{key}={value}" for key, value in words.items()]) == status
-    error = capsys.readouterr().err
-    assert said in error
-    assert len(error.strip().splitlines()) == 1
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
-
-
-@pytest.mark.parametrize(
-    "error",
-    [None, MemoryError(), RuntimeError("CUDA out of memory.\nTried to"), torch.OutOfMemoryError("out of memory")],
-)
-def test_where_memory_does_not_do_it_is_one_line(run, tmp_path, error, capsys, monkeypatch):
-    def out_of_memory(*told):
-        raise error
-
-    if error is None:
-        monkeypatch.setattr(rasterizer, "PAIR_LIMIT", 5)
-    else:
-        monkeypatch.setattr(video, "side_by_side", out_of_memory)
-    assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 1
-    said = capsys.readouterr().err.strip().splitlines()[-1]
-    assert ("more than the 5 that may be held" if error is None else "render: memory is out") in said
-    assert [path.name for path in tmp_path.iterdir()] == ["run"]
-
-
-def test_an_error_of_our_own_keeps_its_trace(run, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "side_by_side", lambda images: {}["of our own"])
-    with pytest.raises(KeyError, match="of our own"):
-        render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"])
-
-
-def test_without_a_file_the_usage_is_said(run, capsys):
-    assert render([str(run)]) == 2
-    assert "out=... is missing: sparsestreet render RUN FILE [key=value ...]" in capsys.readouterr().err
-
-
-def test_another_ending_is_refused_before_torch_is_there(run, tmp_path):
-    code = "import sys; from sparsestreet.cli.commands.render import render; status = render(sys.argv[1:])"
-    code += "; sys.exit(99 if 'torch' in sys.modules else status)"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(run), str(tmp_path / "out.avi")], capture_output=True, text=True
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "a video ends in .mp4, a folder of PNGs has no ending, got 'out.avi'" in done.stderr
 
 
 @pytest.mark.lengthy
@@ -217,130 +102,3 @@ def test_the_lidar_of_another_log_is_refused(finished, tmp_path, capsys):
     description.write_text(re.sub(r'"data_hash": "\w{8}', '"data_hash": "00000000', description.read_text()))
     assert render([str(run), str(tmp_path / "out"), "layers=[lidar]"]) == 1
     assert "the log is not the one that" in capsys.readouterr().err
-
-
-def test_a_place_that_cannot_be_written_is_found_before_the_first_frame(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(video, "side_by_side", lambda images: pytest.fail("a frame was rendered"))
-    (tmp_path / "file").write_text("")
-    assert render([f"scene={run}", f"out={tmp_path / 'file' / 'drive.mp4'}"]) == 1
-    assert "cannot be written" in capsys.readouterr().err
-
-
-def test_ctrl_c_leaves_nothing(run, tmp_path, monkeypatch, capsys):
-    def interrupt(images):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(video, "side_by_side", interrupt)
-    assert render([f"scene={run}", f"out={tmp_path / 'drive.mp4'}"]) == 130
-    assert "stopped, nothing was written" in capsys.readouterr().err
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["run"]
-
-
-def test_the_help_names_every_option():
-    for field in fields(RenderRequest):
-        assert f"\n  {field.name} " in USAGE
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        ([], {"fps": 4.0, "quality": 7.0, "device": None, "count": 5, "size": (48, 32)}),
-        (["quality=2.5", "fps=8", "device=cpu", "width=24", "frames=1:4"],
-         {"fps": 8.0, "quality": 2.5, "device": "cpu", "count": 5, "size": (24, 16)}),
-        (["log_fps=2", "fps=1"], {"fps": 1.0, "quality": 7.0, "device": None, "count": 3, "size": (48, 32)}),
-    ],
-)  # fmt: skip
-def test_everything_that_is_asked_for_arrives(run, tmp_path, monkeypatch, capsys, words, expected):
-    """Five frames at 4 a second; a video of 8 a second of three of them has five, one of half the speed three."""
-    views = read_views(run / "views.json")
-    write_views(run / "views.json", views.training, views.held_out, frame_rate=4.0)
-    opened, given = [], {}
-    stored = stored_street()
-    monkeypatch.setattr(scenes, "open_scene", lambda *place: opened.append(place) or stored)
-    monkeypatch.setattr(video, "path_pictures", lambda *told: given.update(path=told) or iter(()))
-    monkeypatch.setattr(video, "write_pictures", lambda *told, **how: given.update(written=(told, how)) or 77)
-    assert render([f"scene={run}", f"out={tmp_path / 'o'}", "cameras=[2,0]", *words]) == 0
-    assert opened == [(run, expected["device"], ())]
-    shown, path = given["path"]
-    assert shown is stored
-    assert len(path) == expected["count"]
-    assert {(view.camera.width, view.camera.height) for rig in path for view in rig} == {expected["size"]}
-    assert {tuple(view.camera_index for view in rig) for rig in path} == {(2, 0)}
-    (out, _), how = given["written"]
-    assert out == tmp_path / "o"
-    assert how == {"fps": expected["fps"], "quality": expected["quality"]}
-    assert f"{tmp_path / 'o'}: 77 frames of camera 2, 0 at {expected['fps']:g} a second" in capsys.readouterr().out
-
-
-def test_a_path_of_poses_of_ones_own(run, tmp_path, capsys):
-    views = read_views(run / "views.json").all
-    front = [view for view in views if view.camera_index == 0]
-    poses = [
-        {"seconds": 0.1 * view.indices[0], "world_from_camera": inverse(view.camera.camera_from_world).tolist()}
-        for view in front[:3]
-    ]
-    (tmp_path / "poses.json").write_text(json.dumps({"poses": poses}))
-    assert render([f"{run}", f"{tmp_path / 'own'}", f"path={tmp_path / 'poses.json'}"]) == 0
-    shown = pictures(tmp_path / "own")
-    assert len(shown) == 3
-    for picture, view in zip(shown, front, strict=False):
-        # The pose goes through its inverse twice.
-        assert np.abs(picture.astype(int) - rendered(stored_street(), view)).max() <= 1
-    assert f"3 frames of {tmp_path / 'poses.json'} at 10 a second, made" in capsys.readouterr().out
-
-
-def test_nerfstudios_frame_rate_is_that_of_the_video(run, tmp_path, capsys):
-    entry = {"camera_to_world": np.eye(4).flatten().tolist(), "fov": 60}
-    path = tmp_path / "camera_path.json"
-    path.write_text(json.dumps({"camera_path": [entry] * 4, "render_width": 32, "render_height": 24, "fps": 8}))
-    assert render([f"{run}", f"{tmp_path / 'a'}", f"path={path}"]) == 0
-    assert "at 8 a second" in capsys.readouterr().out
-    assert pictures(tmp_path / "a")[0].shape == (24, 32, 3)
-
-
-def test_another_rig(run, tmp_path):
-    words = ["cameras=0", "frames=0:1", "up=1.0", "fov=100", "width=60", "height=30"]
-    assert render([f"{run}", f"{tmp_path / 'a'}", *words]) == 0
-    (shown,) = pictures(tmp_path / "a")
-    path = recorded(street_views(cameras=(0,)))[:1]
-    expected = pinholes(cropped(resized(raised(path, 1.0), 60), 30), 100.0)[0][0]
-    assert np.array_equal(shown, rendered(stored_street(), expected))
-
-
-def test_layers_are_folders_of_exact_values_with_tables(run, tmp_path):
-    out = tmp_path / "layers"
-    words = ["layers=[rgb,depth,alpha,nodes,instances]", "cameras=[0,2]", "frames=1:3"]
-    assert render([f"{run}", f"{out}", *words]) == 0
-    assert sorted(path.name for path in out.iterdir()) == [
-        "alpha", "depth", "instances", "instances.json", "nodes", "nodes.json", "rgb",
-    ]  # fmt: skip
-    view = next(view for view in street_views() if view.indices == (2, 2))
-    expected = layer_values(stored_street(), view, LAYERS)
-    for layer in LAYERS:
-        found = np.asarray(Image.open(out / layer / "camera_2" / "00001.png"))
-        assert np.array_equal(found, expected[layer])
-        assert found.dtype == expected[layer].dtype
-    assert json.loads((out / "nodes.json").read_text()) == {"1": "background", "2": "rigid"}
-    assert json.loads((out / "instances.json").read_text())["2"]["name"] == "tram"
-
-
-def test_seen_images_are_training_images_and_counted_before_edits(run, tmp_path):
-    (tmp_path / "edits.yaml").write_text("remove: [car]", encoding="utf-8")
-    words = ["layers=[seen]", f"edits={tmp_path / 'edits.yaml'}", "cameras=0", "frames=1:2"]
-    assert render([f"{run}", f"{tmp_path / 'out'}", *words]) == 0
-    stored, views = stored_street(), read_views(run / "views.json")
-    count_images(stored, views.training)
-    bare = replace(stored, scene=edited(stored.scene.eval(), Edits({"car": REMOVED})))
-    view = next(view for view in views.all if view.indices == (1, 0))
-    (shown,) = pictures(tmp_path / "out" / "seen")
-    assert np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])
-    count_images(bare, views.all)
-    assert not np.array_equal(shown, layer_values(bare, view, ["seen"])["seen"])
-
-
-def test_a_video_of_layers(run, tmp_path):
-    from tests.export.test_video import read_video
-
-    assert render([f"{run}", f"{tmp_path / 'a.mp4'}", "layers=[rgb,depth]", "cameras=0"]) == 0
-    _, frames = read_video(tmp_path / "a.mp4")
-    assert frames.shape == (5, 64, 48, 3)

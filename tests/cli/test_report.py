@@ -1,12 +1,10 @@
 """The table on the command line."""
 
 import json
-import typing
 
 import pytest
 
-from sparsestreet.cli.commands.report import ReportRequest, report
-from sparsestreet.metrics.definitions import PROTOCOLS
+from sparsestreet.cli.commands.report import report
 from sparsestreet.records.summary import SUMMARY
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import write_sweep
@@ -35,14 +33,6 @@ def test_tables_are_printed_and_written(runs, tmp_path, capsys):
     assert "mean over scenes" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("wanted", "titles"), [("scenes", ["a", "b"]), ("mean", ["mean"])])
-def test_sections_are_chosen(runs, tmp_path, wanted, titles):
-    table = tmp_path / "table.md"
-    assert report([str(runs), f"sections={wanted}", f"markdown={table}"]) == 0
-    found = [line.split()[1] for line in table.read_text().splitlines() if line.startswith("###")]
-    assert found == titles
-
-
 def test_records_of_runs_are_kept_in_a_line_each(tmp_path, capsys):
     """All that a table shows, without a folder of the machine, whose runs may lie anywhere."""
     away = "sparsestreet train data.root=/home/me/drive out=~/x/run seed=3 data.a=[/k/l,/m/n] b=1/2"
@@ -60,54 +50,6 @@ def test_records_of_runs_are_kept_in_a_line_each(tmp_path, capsys):
     assert second["quality"]["held_out"]["psnr_full"] == 24.125
 
 
-def test_a_folder_may_have_an_equals_sign(runs, capsys):
-    assert report([str(runs / "removal_db=0.1")]) == 0
-    assert "ours" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["basline=plain", "."], "no key 'basline'; did you mean 'baseline'?"),
-        ([".", "sections=none"], "sections must be one of scenes, mean, all, got 'none'"),
-        ([".", "protocol=loose"], "protocol must be one of drivestudio, strict, got 'loose'"),
-        (["baseline=plain"], "name folders of runs, or sweep=DIR"),
-    ],
-)
-def test_wrong_usage_is_one_line(arguments, said, capsys):
-    assert report(arguments) == 2
-    assert capsys.readouterr().err.startswith(f"sparsestreet report: {said}")
-
-
-def test_without_a_word_there_is_nothing_to_report(capsys):
-    assert report([]) == 2
-    assert "sparsestreet report DIR" in capsys.readouterr().out
-
-
-def test_protocols_are_those_of_the_metrics():
-    assert typing.get_args(typing.get_type_hints(ReportRequest)["protocol"]) == tuple(PROTOCOLS)
-
-
-def test_help(capsys):
-    assert report(["--help"]) == 0
-    assert "sparsestreet report DIR" in capsys.readouterr().out
-
-
-def test_errors_are_one_line(runs, tmp_path, capsys):
-    assert report([str(tmp_path / "nothing")]) == 1
-    assert report([str(runs), "baseline=ours"]) == 1
-    assert report([str(runs / "a"), "sections=mean"]) == 1
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert [line.split(":")[0] for line in lines] == ["sparsestreet report"] * 3
-
-
-def test_a_protocol_is_chosen(runs, tmp_path):
-    table = tmp_path / "table.md"
-    for protocol, metric in (("drivestudio", "PSNR psnr_full"), ("strict", "PSNR psnr8_no_hood")):
-        assert report([str(runs), f"protocol={protocol}", f"markdown={table}"]) == 0
-        assert f"protocol {protocol}: {metric}" in table.read_text()
-
-
 @pytest.mark.lengthy
 def test_the_report_of_a_sweep(tmp_path, capsys):
     """In the layout that the sweep's name asks for; with a figure where one is wanted."""
@@ -120,14 +62,3 @@ def test_the_report_of_a_sweep(tmp_path, capsys):
     assert "streetgs+paper, seed 0: failed" in text
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert f"{sweep / 'report'}: tables.md" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("arguments", [["sweep=x", "."], ["sweep=x", "baseline=plain"], ["sweep=x", "protocol=mine"]])
-def test_what_does_not_go_with_a_sweep(arguments, capsys):
-    assert report(arguments) == 2
-    assert "sparsestreet report: " in capsys.readouterr().err
-
-
-def test_an_empty_sweep_is_one_line(tmp_path, capsys):
-    assert report([f"sweep={tmp_path}"]) == 1
-    assert "holds no records/summary.json" in capsys.readouterr().err

@@ -2,7 +2,6 @@
 
 import csv
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -14,14 +13,11 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.cli.commands.train import train
-from sparsestreet.cli.runs.resume import resumed_overrides
-from sparsestreet.cli.runs.shared_prefix import check_resumed
+from sparsestreet.cli.runs.folder import check_resumed, resumed_overrides
 from sparsestreet.records.costs import COSTS
-from sparsestreet.records.summary import SUMMARY
 from sparsestreet.training.callbacks import RowLedger
-from tests.cli.conftest import TINY_RIGID
+from tests.cli.conftest import ALL_STAGES, TINY_RIGID
 
 
 def weights(run: Path) -> dict[str, torch.Tensor]:
@@ -33,24 +29,6 @@ def assert_equal(run: Path, other: Path) -> None:
     assert expected.keys() == got.keys()
     for name, value in expected.items():
         assert torch.equal(value, got[name]), name
-
-
-ALL_STAGES = [
-    *TINY_RIGID,
-    "sparsify=removal",
-    "schedule.reset_in.start=0.3",
-    "schedule.reset_in.stop=0.35",
-    "schedule.reset_in.every=10",
-    "schedule.pause_after_reset=12",
-]
-
-
-@pytest.fixture(scope="module")
-def whole(tiny_street, tmp_path_factory) -> Path:
-    """The uninterrupted run, with resets, so that a pause after one can be interrupted too."""
-    out = tmp_path_factory.mktemp("whole") / "run"
-    assert train([*tiny_street, *ALL_STAGES, f"out={out}"]) == 0
-    return out
 
 
 SAMPLED = [
@@ -79,16 +57,8 @@ def stopped_early(tiny_street, tmp_path_factory) -> Path:
     return stopped_at(23, tiny_street, tmp_path_factory.mktemp("stopped") / "run")
 
 
-@pytest.mark.slow
-def test_an_interrupted_run_can_be_evaluated(stopped_early, tmp_path):
-    shutil.copytree(stopped_early, tmp_path / "run")
-    assert evaluate([f"run={tmp_path / 'run'}"]) == 0
-    run = SUMMARY.read(tmp_path / "run").run
-    assert (run.steps, run.max_steps) == (23, 60)
-
-
-def test_resume_equals_the_uninterrupted_run_bit_for_bit(whole, stopped_early):
-    goes_on_to_the_same_end(stopped_early, whole)
+def test_resume_equals_the_uninterrupted_run_bit_for_bit(finished, stopped_early):
+    goes_on_to_the_same_end(stopped_early, finished)
 
 
 @pytest.mark.slow
@@ -100,12 +70,6 @@ def test_sampled_masks_go_on_bit_for_bit(tiny_street, tmp_path):
     removed = {row["step"] for row in ledger if row["reason"] == "mask"}
     assert {"20", "30"} <= removed
     goes_on_to_the_same_end(stopped_at(23, tiny_street, tmp_path / "part", SAMPLED), whole)
-
-
-@pytest.mark.slow
-def test_resume_after_the_mask_stage(whole, tiny_street, tmp_path):
-    """The masks are gone."""
-    goes_on_to_the_same_end(stopped_at(50, tiny_street, tmp_path / "part"), whole)
 
 
 def goes_on_to_the_same_end(part: Path, whole: Path) -> None:
@@ -152,25 +116,8 @@ def _raises_at(step: int):
 
 
 @pytest.mark.slow
-def test_a_signal_inside_a_step(tiny_street, tmp_path, monkeypatch):
-    """In this process, which is told how it would have ended."""
-
-    def signaled(self, trainer, *arguments):
-        if trainer.global_step == 6:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(RowLedger, "on_train_batch_start", signaled, raising=False)
-        with pytest.raises(SystemExit) as ended:
-            train([*tiny_street, *ALL_STAGES, f"out={tmp_path}"])
-    assert ended.value.code == 143
-    assert torch.load(tmp_path / "checkpoints" / "interrupted.ckpt", weights_only=False)["global_step"] == 7
-    assert (tmp_path / "scene.safetensors").is_file()
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_ends_after_the_step_with_its_own_status(whole, tiny_street, tmp_path, number, status):
+def test_a_signal_ends_after_the_step_with_its_own_status(finished, tiny_street, tmp_path, number, status):
     """In a process of its own, at whatever moment of a step the signal comes; then it goes on to the same end."""
     out = tmp_path / "run"
     command = [sys.executable, "-m", "sparsestreet", "train", *tiny_street, *ALL_STAGES, f"out={out}"]
@@ -187,18 +134,14 @@ def test_a_signal_ends_after_the_step_with_its_own_status(whole, tiny_street, tm
     assert (out / "scene.safetensors").is_file()
     assert train([f"resume={out}"]) == 0
     assert not (out / "checkpoints" / "interrupted.ckpt").exists()
-    assert_equal(whole, out)
+    assert_equal(finished, out)
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [("schedule.lambda_m=3.0", "schedule.lambda_m"), ("seed=1", "seed"), ("sparsify=none", "options")],
-)
-def test_another_configuration_is_refused_and_nothing_is_touched(whole, change, said, capsys):
-    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*")}
-    assert train([f"resume={whole}", change]) == 2
-    assert said in capsys.readouterr().err
-    assert {path: path.stat().st_mtime_ns for path in whole.rglob("*")} == before
+def test_another_configuration_is_refused_and_nothing_is_touched(finished, capsys):
+    before = {path: path.stat().st_mtime_ns for path in finished.rglob("*")}
+    assert train([f"resume={finished}", "schedule.lambda_m=3.0"]) == 2
+    assert "schedule.lambda_m" in capsys.readouterr().err
+    assert {path: path.stat().st_mtime_ns for path in finished.rglob("*")} == before
 
 
 @pytest.mark.parametrize(
@@ -207,9 +150,12 @@ def test_another_configuration_is_refused_and_nothing_is_touched(whole, change, 
         ({"trainer": {"accelerator": "gpu", "max_time": "00:01:00:00"}}, None),
         ({"evaluation": {"novel": [1.0]}}, None),
         ({"weight": 2.0}, r"but 1 options differ: weight \(1\.0 before\)"),
-        ({"seed": 4}, r"but 1 options differ: seed \(3 before\)"),
+        (
+            {"seed": 4, "c": 1, "d": 2},
+            r"but 3 options differ: seed \(3 before\), c \(None before\), d \(None before\);",
+        ),
     ],
-    ids=["where it trains", "what is measured", "an option", "the seed"],
+    ids=["where it trains", "what is measured", "an option", "several"],
 )
 def test_what_may_change_when_a_run_goes_on(tmp_path, change, refused):
     config = {"seed": 3, "weight": 1.0, "trainer": {"accelerator": "cpu", "max_time": None}, "folder": str(tmp_path)}
@@ -250,19 +196,3 @@ def test_what_cannot_go_on_is_said(tmp_path):
     for flag in ("-m", "--multirun"):
         with pytest.raises(ValueError, match="a sweep cannot go on with one run: leave out -m or resume"):
             resumed_overrides([flag, f"resume={tmp_path}"])
-
-
-def test_options_that_differ_are_named_with_what_they_were(tmp_path):
-    """The seed first, then the first two others; where a run writes and how it is trained may change."""
-    run = small_run(tmp_path / "run")
-    same = {"seed": 3, "a": {"b": 1}, "out": "y", "trainer": {"precision": 32, "more": 1}}
-    check_resumed(same, run)
-    with pytest.raises(ValueError, match=r"but 1 options differ: a\.b \(1 before\); start a new run"):
-        check_resumed(same | {"a": {"b": 2}}, run)
-    with pytest.raises(ValueError, match=r"but 1 options differ: seed \(3 before\);"):
-        check_resumed(same | {"seed": 4}, run)
-    many = same | {"a": {}, "c": 1, "d": 2, "seed": 4}
-    with pytest.raises(
-        ValueError, match=r"but 4 options differ: seed \(3 before\), a\.b \(1 before\), c \(None before\);"
-    ):
-        check_resumed(many, run)

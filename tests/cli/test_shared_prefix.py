@@ -8,8 +8,7 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import resolved
-from sparsestreet.cli.config.validate import override_problem
-from sparsestreet.cli.runs.shared_prefix import first_pruning, is_branch, moments_to_keep, start_from_trunk
+from sparsestreet.cli.runs.folder import first_pruning, is_branch, moments_to_keep, start_from_trunk
 from sparsestreet.records.configuration import Configuration, flat_config
 from sparsestreet.records.costs import update_costs
 from sparsestreet.records.run import RUN
@@ -31,7 +30,6 @@ RULES = "schedule.removal_at=[0.4,0.6]"
     ("run", "trunk", "moment", "shared"),
     [
         ((*PAPER, "sparsify=importance"), PAPER, 0.93334, True),
-        ((*PAPER, "sparsify=importance"), PAPER, 0.94, False),
         ((*PAPER, "sparsify=paper"), (*PAPER, "sparsify=masks"), 0.93334, True),
         ((*PAPER, "sparsify=paper"), PAPER, 0.1, False),
         # K_min is a matter of masks, where there are any.
@@ -42,7 +40,6 @@ RULES = "schedule.removal_at=[0.4,0.6]"
         (("experiment=rule/random", "schedule.removal_at=[0.93334]"), ("experiment=rule/opacity", RULES), 0.6, False),
         (("seed=1", "sparsify=importance"), (), 0.5, False),
         (("sparsify=importance", "schedule.max_steps=900"), (), 0.5, False),
-        (("sparsify=importance", "node.rigid.max_gaussians=900"), (), 0.5, False),
         (("sparsify=importance", "branch_points=[0.2]", "checkpoint_every=7", "trunk=x"), (), 0.5, True),
     ],
 )
@@ -65,12 +62,6 @@ def test_a_run_keeps_what_its_own_pruning_has_not_touched(words, first, kept):
     cfg = configurations.composed(*words, "branch_points=[0.3,0.6]")
     assert first_pruning(flat_config(resolved(cfg))) == first
     assert moments_to_keep(cfg) == kept
-
-
-@pytest.mark.parametrize("moment", ["0.0", "1.0", "-0.5"])
-def test_a_moment_lies_inside_the_run(moment):
-    said = override_problem([f"branch_points=[0.5,{moment}]"])
-    assert said == f"branch_points are fractions of the run, above 0 and below 1, got {moment}"
 
 
 ARM = ("sparsify=random", "callback.pruning.at=[0.7]")
@@ -164,11 +155,3 @@ def test_a_branch_that_is_none_is_refused_and_touches_nothing(sweep, tmp_path, c
         assert train([f"resume={checkpoint}", *words]) == 2
         assert said in capsys.readouterr().err
     assert {path: path.stat().st_mtime_ns for path in sweep.rglob("*")} == before
-
-
-@pytest.mark.slow
-def test_a_branch_may_be_named(sweep, tmp_path):
-    checkpoint, out = sweep / "none" / "checkpoints" / "before_0.6.ckpt", tmp_path / "named"
-    assert train([f"resume={checkpoint}", *LATE, f"out={out}"]) == 0
-    assert_equal(sweep / "importance", out)
-    assert curve(out) == curve(sweep / "importance")

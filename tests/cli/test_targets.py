@@ -11,8 +11,6 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-from sparsestreet.cli import COMMANDS
-from sparsestreet.cli.commands.bench import bench
 from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.cli.commands.export import export
 from sparsestreet.cli.commands.objects import objects
@@ -20,11 +18,10 @@ from sparsestreet.cli.commands.render import render
 from sparsestreet.cli.commands.serve import serve
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.commands.view import view
-from sparsestreet.cli.config import option_files, targets
-from sparsestreet.cli.config.compose import CONF, TrainSchema
-from sparsestreet.cli.config.targets import check_received, leaves, made, named_by_conf, open_run_config
-from sparsestreet.cli.runs.resume import resumed_overrides
-from tests.cli.configurations import composed
+from sparsestreet.cli.config import targets
+from sparsestreet.cli.config.compose import CONF
+from sparsestreet.cli.config.targets import named_by_conf, open_run_config
+from sparsestreet.cli.runs.folder import resumed_overrides
 
 
 def attacks(mark: str) -> list[dict[str, Any]]:
@@ -35,36 +32,16 @@ def attacks(mark: str) -> list[dict[str, Any]]:
     return [
         {"_target_": "os.system", "command": f"touch {mark}"},
         {"_target_": "posix.system", "_args_": [f"touch {mark}"]},
-        {"_target_": "os.mkdir", "path": mark},
-        {"_target_": "subprocess.run", "args": touch},
         {"_target_": "subprocess.Popen", "args": touch},
-        {"_target_": "setuptools._distutils.spawn.spawn", "cmd": touch},
         {"_target_": "builtins.eval", "_args_": [code]},
-        {
-            "_target_": "code.InteractiveInterpreter.runsource",
-            "_args_": [{"_target_": "code.InteractiveInterpreter"}, code],
-        },
-        {"_target_": "timeit.timeit", "stmt": code, "number": 1},
-        {"_target_": "cProfile.run", "statement": code},
-        {"_target_": "logging.FileHandler", "filename": mark},
-        {"_target_": "logging.config.dictConfig", "config": {"handlers": {"a": {"()": "os.system", "command": mark}}}},
-        {"_target_": "pathlib.Path.write_text", "_args_": [path, "x"]},
         {"_target_": "functools.partial", "_args_": [{"_target_": "pathlib.Path.touch", "_args_": [path]}]},
         {"_target_": "builtins.list", "_args_": [[{"_target_": "os.mkdir", "path": mark}]]},
-        {"_target_": "numpy.testing.measure", "code_str": code},
-        {"_target_": "numpy.save", "file": mark, "arr": [1]},
         {"_target_": "torch.save", "obj": 1, "f": mark},
-        {"_target_": "torch.serialization.load", "f": mark, "weights_only": False},
-        {"_target_": "torch.distributed.run.main", "args": [mark]},
         {"_target_": "lightning.pytorch.loggers.CSVLogger", "save_dir": mark},
-        {"_target_": "lightning.Trainer", "default_root_dir": mark},
         {"_target_": "hydra.utils.instantiate", "config": {"_target_": "os.mkdir", "path": mark}},
         {"_target_": "hydra.utils.get_object", "path": "this"},
-        {"_target_": "omegaconf.OmegaConf.save", "config": {}, "f": mark},
-        {"_target_": "sparsestreet.cli.main", "arguments": ["bench", "--out", mark]},
         {"_target_": "sparsestreet.records.strict_json.write_json", "path": path, "value": 1},
         {"_target_": "sparsestreet.cli.runs.sweep.SweepFolder"},
-        {"_target_": "antigravity.geohash", "_args_": [0, 0, mark]},
     ]
 
 
@@ -103,7 +80,6 @@ def opened_by(run: Path, out: Path) -> list[Callable[[], int]]:
         lambda: export([str(run), str(out / "a.usdz")]),
         lambda: view([str(run), "device=cpu", "port=0"]),
         lambda: serve([str(run), "device=cpu", "port=0"]),
-        lambda: bench(["edits", "--street", str(run), "--quick", "--out", str(out)]),
     ]
 
 
@@ -118,11 +94,8 @@ def test_nothing_that_a_received_run_names_is_made_by_any_command(tmp_path, monk
         wrap = WRAPPED[(number + number // len(WRAPPED)) % len(WRAPPED)]
         run = run_with(tmp_path / "run", PLACES[number % len(PLACES)], wrap(part))
         commands = opened_by(run, tmp_path)
-        try:
-            status: object = commands[number % len(commands)]()
-        except SystemExit as error:  # of bench
-            status = str(error)
-        said = capfd.readouterr().err + str(status)
+        status = commands[number % len(commands)]()
+        said = capfd.readouterr().err
         assert status not in (0, 2), (part, wrap, said)
         assert f"{run}/.hydra/config.yaml" in said, (part, said)
         assert said.count("\n") <= 1
@@ -130,18 +103,11 @@ def test_nothing_that_a_received_run_names_is_made_by_any_command(tmp_path, monk
     assert "this" not in sys.modules
 
 
-def test_every_command_is_among_those_that_are_tried():
-    """Those that open no run: they compose, read records, or read a log."""
-    others = {"demo", "jobs", "report", "data", "effects", "presets", "check"}
-    tried = {"evaluate", "render", "objects", "export", "view", "serve", "bench", "train"}
-    assert others | tried == set(COMMANDS)
-
-
 def test_nobody_makes_parts_of_a_configuration_that_was_not_looked_at():
     """Who reads a run's configuration by ``load_run_config`` compares it; who makes its parts opens it here."""
     sources = {path.name: path.read_text() for path in Path(targets.__file__).parents[1].rglob("*.py")}
     reads = {name for name, text in sources.items() if "load_run_config" in text}
-    assert reads == {"compose.py", "targets.py", "shared_prefix.py", "folder.py", "resume.py"}
+    assert reads == {"compose.py", "targets.py", "folder.py"}
     makers = r"instantiate\(|_locate\(|get_object\(|located\(|get_class\(|import_module\(|reader_of\(|made\("
     assert {name for name in reads if re.search(makers, sources[name])} == {"targets.py"}
 
@@ -150,7 +116,7 @@ def test_the_closed_list_has_what_conf_names():
     """Found once more, by the letters; what stands under hydra is no part of a run."""
     found = {name for path in CONF.rglob("*.yaml") for name in re.findall(r"_target_: ([\w.]+)", path.read_text())}
     assert found - {"sparsestreet.cli.runs.sweep.SweepFolder"} == set(named_by_conf().targets)
-    assert len(found) > 80
+    assert len(found) > 60
     assert "sparsestreet.scene.body.SmplFile" in found  # a comment offers it
     texts = "".join(path.read_text() for path in CONF.rglob("*.yaml"))
     assert texts.count("_target_") == len(re.findall(r"_target_: [\w.]+", texts))  # none is hidden in a text
@@ -159,24 +125,6 @@ def test_the_closed_list_has_what_conf_names():
         "lightning.Trainer": {"trainer"},
         **{f"lightning.pytorch.loggers.{name}Logger": {"logger"} for name in ("CSV", "TensorBoard", "Wandb")},
     }
-
-
-@pytest.mark.parametrize("words", [(), ("sparsify=removal", "method=omnire", "trainer=ddp", "logger=wandb")])
-def test_what_conf_composes_is_fine(words, tmp_path):
-    check_received(OmegaConf.to_container(composed(*words)), tmp_path)
-
-
-def test_a_class_that_conf_gains_is_known_at_once(tmp_path, monkeypatch):
-    (tmp_path / "node").mkdir()
-    (tmp_path / "node" / "kite.yaml").write_text("kite: {parts: [{_target_: sparsestreet.scene.Kite}]}\n")
-    for module in (targets, option_files):
-        monkeypatch.setattr(module, "CONF", tmp_path)
-    named_by_conf.cache_clear()
-    try:
-        assert named_by_conf().targets == {"sparsestreet.scene.Kite": {"node"}}
-    finally:
-        named_by_conf.cache_clear()
-    assert "node" in TrainSchema.__dataclass_fields__
 
 
 @pytest.mark.parametrize(
@@ -200,13 +148,6 @@ def test_a_part_from_outside_is_imported_where_the_user_trusts_its_module(where,
         open_run_config(run, ("..",))
 
 
-def test_a_part_that_cannot_be_made_is_one_line():
-    part = OmegaConf.create({"log": {"_target_": "sparsestreet.evaluation.extra.ExtraMetrics", "kites": 1}})
-    with pytest.raises(ValueError, match=r"^log cannot be made: .* unexpected keyword argument 'kites'") as told:
-        made(part.log)
-    assert "\n" not in str(told.value)
-
-
 def received(folder: Path, *words: str) -> Path:
     """A run with a checkpoint, whose words are these."""
     (folder / "checkpoints").mkdir(parents=True)
@@ -221,24 +162,13 @@ def received(folder: Path, *words: str) -> Path:
     ("word", "said"),
     [
         ("++node.background.zzz={_target_:numpy.testing.measure,code_str:x}", "names 'numpy.testing.measure', which"),
-        ("++loss.mine=[{_target_:mypaper.Mine}]", r"names 'mypaper.Mine', which conf/ does not: say parts=\[mypaper\]"),
-        ("++evaluation.timing._target_=os.system", "evaluation.timing._target_ names 'os.system'"),
         ("hydra.searchpath=[pkg://this]", "nothing of Hydra's"),
         ("hydra/launcher=joblib", "nothing of Hydra's"),
-        ("++hydra.job_logging.handlers.file.class=os.system", "nothing of Hydra's"),
-        ("++node/rigid@hydra.callbacks.x=rigid", "nothing of Hydra's"),
         ("--config-dir=/tmp", "no flag"),
-        ("-m", "no flag"),
         ("++folder=/tmp", "no folder"),
         ("++data.root=${oc.env:HOME}", "data.root is .*asks for what conf/ never asks for: write its value"),
-        ("++seed='${oc.decode:\"1\"}'", "asks for what"),
-        ("++data.log.x='${by_drive:{1: {_target_: os.system}}}'", "asks for what"),
         ("logger.save_dir=/tmp/elsewhere", "does not choose where it writes or whom it calls"),
-        ("++logger.project=theirs", "does not choose where it writes or whom it calls"),
-        ("callback.row_ledger.path=/tmp/elsewhere.csv", "does not choose where it writes"),
-        ("callback={row_ledger:{path:/tmp/elsewhere.csv}}", "does not choose where it writes"),
         ("++trainer.profiler=advanced", "trainer.profiler is 'advanced'"),
-        ("++trainer.callbacks=[{_target_:sparsestreet.training.callbacks.RowLedger}]", "names below callback alone"),
         ("++callback.row_ledger._args_=[/tmp/x]", "Hydra's _args_"),
     ],
 )
@@ -254,9 +184,6 @@ def test_words_of_a_received_run_choose_no_code_and_no_place(word, said, tmp_pat
     ("package", "content", "key"),
     [
         ("hydra.job_logging.handlers.file", "{class: os.system, command: touch here}", "job_logging"),
-        ("hydra.callbacks.mine", "{_target_: os.mkdir, path: here}", "callbacks"),
-        ("hydra.job", "{name: ../../elsewhere}", "job"),
-        ("hydra", "{mode: MULTIRUN}", "mode"),
     ],
 )
 def test_a_file_outside_of_conf_reaches_hydra_no_more_than_a_word(package, content, key, tmp_path):
@@ -289,27 +216,3 @@ def test_what_the_user_says_now_is_the_users(tmp_path, capsys):
     assert part in resumed_overrides([*asked, part])
     with pytest.raises(ValueError, match=r"say parts=\[tests\.cli\.toy\.loss\] if its code is trusted"):
         resumed_overrides(asked, ["tests.cli.toys"])
-
-
-def test_a_folder_of_the_users_own_options_is_named_again(tmp_path, capsys):
-    outside = f"hydra.searchpath=[file://{Path(__file__).parent / 'toy' / 'conf'}]"
-    run = received(tmp_path / "other", "loss=[photometric,sky,mean_color]")
-    with pytest.raises(ValueError, match=r"loss\.mean_color\._target_ names 'tests\.cli\.toy\.loss\.MeanColor'"):
-        resumed_overrides([f"resume={run}", outside])
-    assert resumed_overrides([f"resume={run}", outside, "logger.save_dir=/tmp/mine"], ["tests.cli.toy"])
-    assert train(["parts=[tests.cli.toy]"]) == 2
-    assert "parts=[...] says which modules of resume=RUN are trusted" in capsys.readouterr().err
-
-
-def test_lists_in_lists_have_their_places():
-    assert [*leaves({"a": [{"_target_": {"b": 1}}, []], "c": {}})] == [
-        (("a", "0", "_target_"), {"b": 1}),
-        (("a", "1"), []),
-        (("c",), {}),
-    ]
-
-
-@pytest.mark.parametrize("target", ["os.system", "sparsestreet.cli.main"])
-def test_of_what_no_scene_has_nobody_is_asked_to_trust_the_module(target: str):
-    with pytest.raises(ValueError, match=r"(not to be trusted|do not trust it)$"):
-        check_received({"evaluation": {"_target_": target}}, Path("run"))

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from sparsestreet.evidence.bundle import LEAST_NOISE, PRIOR, adjust
-from sparsestreet.triangulation.rays import Observations, meet
+
+from sparsestreet.evidence.poses import LEAST_NOISE, PRIOR, adjust
+from sparsestreet.triangulation.points import Observations, meet
 
 IMAGES, POINTS, FOCAL = 3, 12, 8.0
 """So few pixels a meter that the prior weighs about as much as the rays."""

@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sparsestreet.evidence.bundle import Bundle
 
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.evidence import poses
-from sparsestreet.evidence.poses import PoseNoise, pose_noise
+from sparsestreet.evidence.poses import Bundle, PoseNoise, pose_noise
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import project
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints

@@ -20,7 +20,6 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 import pytest
 import torch
-from sparsestreet.training.callbacks.files import step_of
 
 from sparsestreet.data.images import image_size, read_image
 from sparsestreet.data.pandaset.frames import read_columns
@@ -32,6 +31,7 @@ from sparsestreet.scene.body.smpl_file import SmplFile
 from sparsestreet.scene.edits import read_edits
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.scene.views import read_views
+from sparsestreet.training.callbacks.checkpoints import step_of
 from tests.data.damage import Damage, long, written
 from tests.stress.forked import Forked, command
 from tests.stress.runs import MORE_MB, assert_refused, contents, cut_short, on_drive, street_of

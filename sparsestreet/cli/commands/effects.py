@@ -59,40 +59,35 @@ def effects(arguments: list[str]) -> int:
 
 def planned(overrides: Sequence[str]) -> tuple[EffectDecision, ...]:
     """The plan of a training with these options."""
-    from sparsestreet.cli.config.assemble import data_of, recipe_of, with_views
+    from sparsestreet.cli.runs.run import opened
 
-    cfg = composed(overrides)
-    data = data_of(cfg)
-    recipe = recipe_of(with_views(cfg, data))
+    _, data, recipe = opened(composed(overrides))
     return recipe.decisions(recipe.plan(data), data)
 
 
 def known_effects(overrides: Sequence[str]) -> "tuple[Mapping[str, EffectSettings], TrainingData]":
     """The effects that a training with these options knows, and what they would be built from."""
-    from sparsestreet.cli.config.assemble import data_of, recipe_of, with_views
+    from sparsestreet.cli.runs.run import opened
     from sparsestreet.scene.initialize.training_data import TrainingData
 
-    cfg = composed(overrides)
-    data = data_of(cfg)
-    effects = recipe_of(with_views(cfg, data)).effects
-    return effects, TrainingData(data.driving_log, data.split.train, data.split.held_out_indices)
+    _, data, recipe = opened(composed(overrides))
+    return recipe.effects, TrainingData(data.driving_log, data.split.train, data.split.held_out_indices)
 
 
 def _plan(cfg: DictConfig, out: Path | None) -> Iterator[str]:
-    from sparsestreet.cli.config.assemble import data_of, recipe_of, with_views
+    from sparsestreet.cli.runs.run import opened
     from sparsestreet.pictures.plots import draw_evidence
 
-    started = time.perf_counter()
-    data = data_of(cfg)
-    recipe = recipe_of(with_views(cfg, data))
-    opened = time.perf_counter()
+    times = [time.perf_counter()]
+    _, data, recipe = opened(cfg)
+    times.append(time.perf_counter())
     plan = recipe.plan(data)
     decisions = recipe.decisions(plan, data)
-    planned = time.perf_counter()
+    times.append(time.perf_counter())
     log = data.driving_log
     yield f"{log.name}: {len(data.split.train)} training images of {log.num_cameras} cameras"
     yield from plan_lines(decisions)
-    yield f"\nread in {opened - started:.1f} s, planned in {planned - opened:.1f} s"
+    yield f"\nread in {times[1] - times[0]:.1f} s, planned in {times[2] - times[1]:.1f} s"
     panels = [panel for effect in plan.effects for panel in effect.finding.evidence()]
     if panels:
         picture = (Path("outputs/effects") / log.name if out is None else out) / "evidence.png"

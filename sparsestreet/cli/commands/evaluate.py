@@ -9,9 +9,9 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli.commands.options import run_command
 from sparsestreet.cli.commands.scenes import open_scene
-from sparsestreet.cli.config.assemble import data_of, this_command
 from sparsestreet.cli.config.targets import made, open_run_config
 from sparsestreet.cli.config.validate import device_of, type_problem
+from sparsestreet.cli.runs.run import data_of, this_command
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.naming import printable
 from sparsestreet.records.run import RUN, RunDescription, this_machine

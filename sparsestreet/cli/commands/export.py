@@ -10,6 +10,7 @@ from sparsestreet.naming import one_line
 if TYPE_CHECKING:
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.scene.views import RecordedViews
+    from sparsestreet.types import Gaussians
 
 USAGE = """\
 sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers read it
@@ -51,6 +52,7 @@ of a .usdz:
 """
 
 DEFAULT_SHAPES = 4.0
+ANTIALIAS_LOST = "trained with antialias: plain viewers show small Gaussians brighter"
 
 _FRAME = ("time", "nodes", "instance")
 _OWN = {
@@ -109,37 +111,97 @@ def export(arguments: list[str]) -> int:
 
 def _export(request: ExportRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
-    if request.out.suffix == ".usdz":
-        from sparsestreet.cli.commands.export_files import export_artifact
-
-        export_artifact(request.scene, request.out, request.car, request.mount, request.names, request.parts)
-        return
     from sparsestreet.cli.commands.scenes import open_scene, recorded_views, with_edits
 
+    if request.kind == ".usdz":
+        return _export_artifact(request)
     stored = open_scene(request.scene, "cpu", request.parts)
     if request.kind == ".street":
         return _export_street(request, stored)
     if request.kind in (".html", "") or request.edits is not None:
         views = recorded_views(request.scene, request.views)
         stored = with_edits(stored, views, request.edits)
-        if request.out.suffix == ".html":
+        if request.kind == ".html":
             return _export_page(request, stored, views)
         if request.kind == "":
             return _export_objects(request, stored, views)
-    from sparsestreet.cli.commands.export_files import FrameExport, export_frame
+    _export_frame(request, stored)
 
-    wanted = FrameExport(
-        request.scene,
-        request.views,
-        request.out,
-        request.kind,
-        request.time or 0.0,
-        request.nodes,
-        request.instance,
-        sky=request.sky is not False,
-        check=bool(request.check),
-    )
-    export_frame(wanted, stored)
+
+def _export_frame(request: ExportRequest, stored: "StoredScene") -> None:
+    """Write one moment for viewers. Raises ValueError where it shows nothing."""
+    from sparsestreet.export.frame import UNSEEN, frame_gaussians
+    from sparsestreet.export.ply import scene_gaussians, write_ply
+    from sparsestreet.export.spz import spz_notes, write_spz
+
+    time, mip, plain = request.time or 0.0, stored.options.settings.antialias, request.kind == ".ply"
+    chosen = {"nodes": request.nodes, "instances": None if request.instance is None else [request.instance]}
+    gaussians = scene_gaussians(stored, time, **chosen)
+    if plain:
+        left_out, why = int((gaussians.opacities == 0).sum()), "are not there"
+    else:
+        left_out, why = int((gaussians.opacities < UNSEEN).sum()), "have an opacity below 1 / 255"
+        gaussians = frame_gaussians(stored, time, **chosen, sky=request.sky is not False)
+    count = (write_ply if plain else write_spz)(request.out, gaussians, antialiased=mip)
+    size = request.out.stat().st_size
+    print(f"{request.out}: {count:,} Gaussians at time {time:g}, {size / 1e6:.2f} MB, {size / count:.1f} bytes each")
+    if left_out:
+        print(f"left out: {left_out:,} Gaussians that {why} at this time")
+    if mip and plain:
+        print(ANTIALIAS_LOST)
+    for note in [] if plain else spz_notes(gaussians):
+        print(note)
+    has_sky = not plain and request.sky is not False and request.nodes is None and request.instance is None
+    sky = "the sky's infinite distance, as it is a dome" if has_sky else "the sky"
+    print(f"lost: {'; '.join([f'time, as this is the moment {time:g}', sky, *_lost_of_scene(stored)])}")
+    if request.check:
+        _check(request, stored, gaussians)
+
+
+def _check(request: ExportRequest, stored: "StoredScene", gaussians: "Gaussians") -> None:
+    """Read the file again, seen by the camera of the view nearest in time, in the axes of viewers."""
+    from sparsestreet.cli.commands.scenes import recorded_views
+    from sparsestreet.export.frame import VIEWER_FROM_WORLD
+    from sparsestreet.export.spz import check_file, read_spz, turned_camera
+
+    try:
+        views = recorded_views(request.scene, request.views).all
+        nearest = min(views, key=lambda view: abs(view.time - (request.time or 0.0)))
+        camera = turned_camera(nearest.camera, VIEWER_FROM_WORLD)
+    except FileNotFoundError:
+        camera = None
+    found = check_file(request.out, gaussians, camera, read_spz, stored.options.settings)
+    quality = "no camera is known" if found.psnr is None else f"{found.psnr:.1f} dB beside what was written"
+    print(f"read by {found.reader}: {found.gaussians:,} Gaussians, {quality}, {found.bytes_each:.1f} bytes each")
+
+
+def _lost_of_scene(stored: "StoredScene") -> list[str]:
+    """Return what no file for viewers holds of a scene: masks over time, effects of the cameras."""
+    lost = []
+    if any(node.mask is not None for node in stored.scene.nodes.values()):
+        lost.append("masks, but for what they show now")
+    effects = [name for name in stored.scene.effects if name != "sky"]
+    return [*lost, f"effects of the cameras ({', '.join(effects)})"] if effects else lost
+
+
+def _export_artifact(request: ExportRequest) -> None:
+    from sparsestreet.cli.commands.scenes import open_scene
+    from sparsestreet.records.run import RUN
+    from sparsestreet.scene.beside import views_of
+
+    try:
+        from sparsestreet.serving.artifact import DEFAULT_CAR, Provenance, write_artifact
+        from sparsestreet.serving.scenes import RigOptions, named_runs, open_run
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"a .usdz needs {error.name}: pip install 'sparsestreet[serve]'") from error
+    run, options = request.scene, RigOptions(request.mount, request.names)
+    (name,) = named_runs([run])
+    served = open_run(run, name, lambda path: open_scene(path, "cpu", request.parts), options)
+    of = RUN.find(run)
+    provenance = Provenance("", "", 0) if of is None else Provenance(of.source.commit or "", of.data_hash, of.seed)
+    counts = write_artifact(request.out, served, views_of(run), provenance, request.car or DEFAULT_CAR)
+    said = ", ".join(f"{count} {what[:-1] if count == 1 else what}" for what, count in counts.items())
+    print(f"{request.out}: scene {name!r} with {said}; sparsestreet serve {run} gives its pictures")
 
 
 def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
@@ -152,7 +214,6 @@ def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
 
 
 def _export_objects(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
-    from sparsestreet.cli.commands.export_files import ANTIALIAS_LOST, lost_of_scene
     from sparsestreet.export.objects import POSES, write_objects
     from sparsestreet.export.ply import instance_names
 
@@ -163,11 +224,10 @@ def _export_objects(request: ExportRequest, stored: "StoredScene", views: "Recor
         print(f"left out, as no recorded frame shows them: {', '.join(map(one_line, absent))}")
     if stored.options.settings.antialias:
         print(ANTIALIAS_LOST)
-    print(f"lost: {'; '.join(['the sky', 'how shapes change', *lost_of_scene(stored)])}")
+    print(f"lost: {'; '.join(['the sky', 'how shapes change', *_lost_of_scene(stored)])}")
 
 
 def _export_page(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
-    from sparsestreet.cli.commands.export_files import ANTIALIAS_LOST, lost_of_scene
     from sparsestreet.cli.commands.scenes import log_seconds
     from sparsestreet.export.frame import dome_around
     from sparsestreet.export.page import viser_module, write_page
@@ -189,4 +249,4 @@ def _export_page(request: ExportRequest, stored: "StoredScene", views: "Recorded
     )
     if stored.options.settings.antialias:
         print(ANTIALIAS_LOST)
-    print(f"lost: {'; '.join(['colors that change with the direction', *lost_of_scene(stored)])}")
+    print(f"lost: {'; '.join(['colors that change with the direction', *_lost_of_scene(stored)])}")

@@ -22,9 +22,9 @@ CUDA_TORCH = (
     "(CUDA 13.0; pytorch.org lists others)"
 )
 """A build that is there satisfies pip, with CUDA or without."""
-LEAST_CAPABILITY = (8, 0)
+MIN_CAPABILITY = (8, 0)
 """Of NVIDIA's devices: what Triton compiles for (A100, RTX 30 and newer)."""
-LEAST_GB = 1.0
+MIN_GB = 1.0
 """Free memory without which not even a small street trains."""
 SIDE, ROWS = 64, 200
 """Of the image that is drawn, pixels, and of its Gaussians."""
@@ -89,8 +89,8 @@ def device() -> str:
         raise MissingError(f"{reason}: {remedy}")
     capability = torch.cuda.get_device_capability()
     name = "{}, compute capability {}.{}".format(torch.cuda.get_device_name(), *capability)
-    if capability < LEAST_CAPABILITY:
-        least = "{}.{}".format(*LEAST_CAPABILITY)
+    if capability < MIN_CAPABILITY:
+        least = "{}.{}".format(*MIN_CAPABILITY)
         raise MissingError(f"{name}, and kernels need {least}: take another device, or train with trainer=cpu")
     try:
         torch.ones(2, device="cuda").sum().item()
@@ -129,7 +129,7 @@ def memory() -> str:
     import torch
 
     free, total = (1e-9 * count for count in torch.cuda.mem_get_info())
-    if free < LEAST_GB:
+    if free < MIN_GB:
         raise MissingError(
             f"{free:.1f} of {total:.1f} GB are free: nvidia-smi lists who holds the rest; end it, or name another "
             "device with CUDA_VISIBLE_DEVICES"

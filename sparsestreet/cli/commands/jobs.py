@@ -16,7 +16,7 @@ from rich.table import Table
 
 from sparsestreet.cli.config.compose import as_typed, configuration, resolved
 from sparsestreet.cli.config.validate import SWEEPS, flags_of, override_problem
-from sparsestreet.cli.runs.shared_prefix import first_pruning, identity_of_trunk, moments_to_keep
+from sparsestreet.cli.runs.folder import first_pruning, identity_of_trunk, moments_to_keep
 from sparsestreet.cli.runs.sweep import finished, jobs_of, with_fixed_keys
 from sparsestreet.records.configuration import flat_config
 

@@ -19,9 +19,6 @@ from sparsestreet.naming import nearest, printable
 
 Options = TypeVar("Options")
 
-FEW = 20
-"""Keys that an error still lists."""
-
 _WORDS = {"true": True, "false": False}
 
 
@@ -98,7 +95,7 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | S
         if not equals or not key.isidentifier() or (paths and Path(word).exists()):
             loose.append(word)
         elif key not in names:
-            raise OptionError(unknown_key(key, names))
+            raise OptionError(_unknown_key(key, names))
         elif key in given:
             raise OptionError(f"{key} is given twice: choose one")
         else:
@@ -120,16 +117,10 @@ def parse_options(words: Sequence[str], kind: type[Options], positional: str | S
         raise OptionError(str(error)) from error
 
 
-def unknown_key(key: str, known: Iterable[str], about: Callable[[str], str] = lambda key: "") -> str:
-    """One line about a key that does not exist, with the one that was probably meant, or all where they are few.
-
-    ``about`` adds what is to be said of the one that was meant.
-    """
-    known = list(known)
+def _unknown_key(key: str, known: Sequence[str]) -> str:
+    """Return one line about a key that does not exist, with the one that was probably meant, or all."""
     close = nearest(key, known, cutoff=0.5)
-    if close:
-        return f"no key {key!r}; did you mean {close[0]!r}?{about(close[0])}"
-    return f"no key {key!r}" + (f"; there are {', '.join(known)}" if len(known) <= FEW else "")
+    return f"no key {key!r}; " + (f"did you mean {close[0]!r}?" if close else f"there are {', '.join(known)}")
 
 
 def _value(key: str, text: str, kind: Any) -> Any:

@@ -17,10 +17,8 @@ from sparsestreet.cli.config.compose import CONF, as_typed, composed, resolved, 
 from sparsestreet.cli.config.log_from_options import with_found_data
 from sparsestreet.cli.config.validate import flag_problem, override_problem, with_effect_keys
 from sparsestreet.cli.process import is_worker_rank, name_beside_first, set_log_prefix
-from sparsestreet.cli.runs.folder import folder_problem, leave_folder
+from sparsestreet.cli.runs.folder import check_resumed, folder_problem, leave_folder, resumed_overrides
 from sparsestreet.cli.runs.locks import sole_writer
-from sparsestreet.cli.runs.resume import resumed_overrides
-from sparsestreet.cli.runs.shared_prefix import check_resumed
 from sparsestreet.cli.runs.sweep import (
     SweepFolder,
     as_sweep,

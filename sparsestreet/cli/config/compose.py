@@ -1,4 +1,4 @@
-"""Where the configuration lies, its strict root, and errors that name the key that was probably meant."""
+"""Where the configuration lies, its options and strict root, and words as Hydra's grammar takes them."""
 
 import io
 import re
@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -16,10 +17,60 @@ from hydra.errors import HydraException
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.config.option_files import CONF
 from sparsestreet.cli.config.resolvers import register_resolvers
 from sparsestreet.files import read_yaml
 
+PACKAGE = Path(__file__).resolve().parents[2]
+# An installed wheel carries conf/ inside the package; a checkout has it beside the package.
+CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "conf"
+
+GLOBAL = "# @package _global_"
+"""First line of a file whose keys begin at the root."""
+LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_NAMED = ("effects", "loss", "callback", "source")
+"""Groups of which several options are chosen at once: each stands below its own name."""
+
+
+def config_files() -> Iterator[tuple[str, bool, Any]]:
+    """Yield the path below conf/ of each option, without its ending, whether its keys are global, and its tree."""
+    for path in sorted(CONF.rglob("*.yaml")):
+        place = path.relative_to(CONF).with_suffix("")
+        if place.parts[0] != "options":
+            text = path.read_text(encoding="utf-8")
+            yield place.as_posix(), text.startswith(GLOBAL), yaml.load(text, LOADER) or {}
+    yield from _short_options()
+
+
+def _short_options() -> Iterator[tuple[str, bool, Any]]:
+    """Yield the same of those in conf/options: ``options/experiment.yaml`` holds ``experiment/claim/node_aware``."""
+    for path in sorted((CONF / "options").glob("*.yaml")):
+        text = path.read_text(encoding="utf-8")
+        for name, option in (yaml.load(text, LOADER) or {}).items():
+            tree = {name: option} if path.stem in _NAMED else option or {}
+            yield f"{path.stem}/{name}", text.startswith(GLOBAL), tree
+
+
+@cache
+def options_of(group: str) -> tuple[str, ...]:
+    """Return the names of the options of a group, sorted; none where conf/ has no such group."""
+    names = (name.rpartition("/") for name, _, _ in config_files())
+    return tuple(sorted(name for folder, _, name in names if folder == group))
+
+
+def option_tree(group: str, name: str) -> Any:
+    """Return what conf/ says of an option, as plain values."""
+    return next(tree for place, _, tree in config_files() if place == f"{group}/{name}")
+
+
+def register_options() -> None:
+    """Tell Hydra of the options in conf/options, which reads files of single options itself."""
+    for place, anywhere, tree in _short_options():
+        group, _, name = place.rpartition("/")
+        package = "_global_" if anywhere else None
+        ConfigStore.instance().store(name=name, node=tree, group=group, package=package, provider="conf/options")
+
+
+register_options()
 register_resolvers()
 
 
@@ -154,6 +205,11 @@ def without_flags(overrides: Sequence[str]) -> list[str]:
 
 def _is_flag(before: str, text: str) -> bool:
     return text.startswith("-") or (before.startswith("-") and "=" not in text)
+
+
+def is_sweep(text: str) -> bool:
+    """Whether an override asks for several jobs. Raises OverrideParseException for one that cannot be read."""
+    return OverridesParser.create().parse_overrides([text])[0].is_sweep_override()
 
 
 def check_moved(cfg: DictConfig) -> None:

@@ -19,8 +19,7 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.config.compose import TrainSchema, load_run_config
-from sparsestreet.cli.config.option_files import CONF, config_files
+from sparsestreet.cli.config.compose import CONF, TrainSchema, config_files, load_run_config
 
 # ``hydra.utils.get_object`` logs what it raises
 
@@ -86,11 +85,6 @@ def leaves(tree: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
             yield (*place, TARGET), value  # a mapping in its place is no name
         else:
             yield from leaves(value, (*place, str(name)))
-
-
-def targets_of(tree: object) -> Iterator[str]:
-    """Yields the names of all classes that a configuration names."""
-    return (str(value) for place, value in leaves(tree) if place[-1] == TARGET)
 
 
 def open_run_config(run: Path, parts: Sequence[str] = ()) -> DictConfig:

@@ -14,14 +14,22 @@ from importlib.util import find_spec
 from beartype.door import is_bearable
 from beartype.roar import BeartypeException
 from hydra import compose
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from yaml import YAMLError
 
-from sparsestreet.cli.config.compose import MOVED, composed, configuration, without_flags
-from sparsestreet.cli.config.option_files import CONF, config_files, option_tree, options_of
+from sparsestreet.cli.config.compose import (
+    CONF,
+    MOVED,
+    composed,
+    config_files,
+    configuration,
+    is_sweep,
+    option_tree,
+    options_of,
+    without_flags,
+)
 from sparsestreet.cli.config.targets import located
 from sparsestreet.cli.process import shares_a_run
 from sparsestreet.naming import nearest
@@ -104,7 +112,7 @@ def override_problem(overrides: list[str]) -> str | None:
             return f"{text}: folder follows from out, and a value of its own would lead nowhere: give out=DIR"
     try:
         # A sweep (a=1,2) composes for no single job; Hydra's sweeper splits it first.
-        single = [text for text in keyed if not _is_sweep(text)]
+        single = [text for text in keyed if not is_sweep(text)]
         if len(single) < len(keyed) and not {"-m", "--multirun"} & set(overrides):
             several = next(text for text in keyed if text not in single)
             return f"{several} asks for several runs: add -m, or choose one"
@@ -119,11 +127,6 @@ def override_problem(overrides: list[str]) -> str | None:
         reason = str(cause)
         return _explain(f"{key}: {reason}" if key and key not in reason.splitlines()[0] else reason, single)
     return limit_problem(cfg) or _masks_that_are_off(single, cfg)
-
-
-def _is_sweep(text: str) -> bool:
-    """Whether an override asks for several jobs. Raises OverrideParseException for one that cannot be read."""
-    return OverridesParser.create().parse_overrides([text])[0].is_sweep_override()
 
 
 def _masks_that_are_off(overrides: list[str], cfg: DictConfig) -> str | None:

@@ -1,27 +1,132 @@
-"""The folder of a run: refused where another run lies there, taken once the data is read, left as it was found."""
+"""The folder of a run: what it goes on from or begins with, refused where another run lies there, left as found."""
 
 import logging
+import math
 import os
 import re
 import shutil
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+import yaml
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from sparsestreet.atomic import atomic_file
-from sparsestreet.cli.config.compose import load_run_config, resolved
-from sparsestreet.cli.config.targets import leaves
-from sparsestreet.cli.runs.resume import has_checkpoint, run_of
-from sparsestreet.records.configuration import Configuration, config_hash, flat_config, only
+from sparsestreet.cli.config.compose import configuration, load_run_config, quoted, resolved, value_of, without_flags
+from sparsestreet.cli.config.targets import check_modules, check_places, check_received, leaves
+from sparsestreet.cli.process import shares_a_run
+from sparsestreet.files import read_yaml
+from sparsestreet.naming import checkpoint_fraction
+from sparsestreet.records.configuration import IDENTITY_KEYS, Configuration, config_hash, flat_config, only, without
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.file import check_links
 from sparsestreet.records.run import RUN, RunDescription
 from sparsestreet.records.strict_json import RecordError
+
+_PASSING = {"overrides", "runtime", "sweeper", "sweep"}
+"""Keys of hydra's own configuration that follow from the words, or act in sweeps alone."""
+
+
+def resumed_overrides(arguments: list[str], parts: Sequence[str] = ()) -> list[str]:
+    """The overrides of the run that ``resume=RUN`` (or one of its checkpoints) names, then those that were given.
+
+    An option that is given again counts as it is given now. The run's folder is gone on in, unless ``out=`` names
+    another, or the checkpoint is one that was kept before a moment: a branch has a folder of its own. Without
+    ``resume=`` they are as given.
+
+    The run's own may come from anybody: what they name beyond conf/ must lie in ``parts``, modules that the user's own
+    command trusts, or be said in this command.
+
+    Raises FileNotFoundError where no run is at that place, ValueError in a sweep, and for what is not to be trusted.
+    """
+    given = next((value_of(text) for text in arguments if text.startswith("resume=")), "null")
+    if given in ("null", "None", ""):
+        return arguments
+    if {"-m", "--multirun"} & set(arguments):
+        raise ValueError("a sweep cannot go on with one run: leave out -m or resume")
+    run = run_of(Path(given))
+    load_run_config(run)  # says what a run's folder is, where this is none
+    if not has_checkpoint(run):
+        raise FileNotFoundError(
+            f"resume={given}: it was ended before its first checkpoint (checkpoint_every=...): start it again with "
+            f"its own options and out={run}"
+        )
+    source = run / ".hydra" / "overrides.yaml"
+    overrides = read_yaml(source, yaml.safe_load)
+    if not isinstance(overrides, list):
+        raise ValueError(f"{source} is damaged: it holds no list of options")
+    own = {"resume", "out", "overwrite", *(_key_of(text) for text in arguments)}
+    kept = [text for text in map(str, overrides) if _key_of(text) not in own]
+    branches = checkpoint_fraction(Path(given)) is not None
+    folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={quoted(str(run))}"]
+    _check_words(kept, without_flags([*arguments, *folder]), source, parts)
+    return [*kept, *arguments, *folder]
+
+
+def _check_words(received: list[str], typed: list[str], source: Path, parts: Sequence[str]) -> None:
+    """Raises ValueError where words that came with a run choose what only the user's own may."""
+    check_modules(parts)
+    for text in received:
+        if text.startswith("-") or "hydra" in text.partition("=")[0] or _key_of(text) == "folder":
+            raise ValueError(
+                f"{source} has {text[:100]!r}: a run that was received chooses no flag, no folder and nothing of "
+                "Hydra's; take it out, and say it in this command if it is yours"
+            )
+    try:
+        merged = _raw([*received, *typed])
+    except (HydraException, OmegaConfBaseException, ValueError):
+        return  # nothing is made of words that do not compose; ``override_problem`` says why
+    plain = _own([*typed])
+    hydra, own = merged.pop("hydra"), plain.pop("hydra")
+    for one in (hydra, own):
+        one["job"].pop("override_dirname", None)  # which follows from the words
+    if changed := [key for key in hydra.keys() - _PASSING if hydra[key] != own.get(key)]:
+        raise ValueError(f"{source} changes hydra.{changed[0]}, which a run that was received does not choose")
+    said = frozenset((place, repr(value)) for place, value in leaves(plain))
+    check_received(merged, source, parts, said)
+    check_places(merged, source, said)
+
+
+def _own(typed: list[str]) -> dict[str, Any]:
+    """The configuration of the user's words alone; of those of Hydra's, where the others need the run's."""
+    for words in (typed, [text for text in typed if text.startswith("hydra")]):
+        try:
+            return _raw(words)
+        except (HydraException, OmegaConfBaseException, ValueError):
+            continue
+    return _raw([])
+
+
+def _raw(words: list[str]) -> dict[str, Any]:
+    """As plain values, interpolations as they are written."""
+    with configuration():
+        cfg: Any = OmegaConf.to_container(compose("train", words, return_hydra_config=True))
+    return cfg
+
+
+def _key_of(override: str) -> str:
+    return override.partition("=")[0].lstrip("+~")
+
+
+def run_of(path: Path) -> Path:
+    """The folder of a run, given as it is or by one of its checkpoints."""
+    if not path.exists():
+        raise FileNotFoundError(f"resume={path}: there is nothing; give a run's folder or one of its checkpoints")
+    return path if path.is_dir() else path.resolve().parents[1]
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Whether a run has one that is whole."""
+    return any((run / "checkpoints").glob("[!.]*.ckpt"))
+
 
 log = logging.getLogger(__name__)
 
@@ -200,3 +305,87 @@ def _description(out: Path) -> RunDescription | None:
         return RUN.find(out)
     except RecordError:
         return None
+
+
+OF_PRUNING = (
+    "callback.pruning.*",
+    # What these lead to is compared where it acts.
+    "schedule.removal_at",
+    "schedule.removal_db",
+    "sparsify.name",
+    "sparsify.label",
+    "sparsify.control",
+    # Floors and rights that pruning alone asks for.
+    "node.*.min_instance_gaussians",
+    "node.*.prunable",
+)
+"""Options that act when something is pruned, and never before."""
+
+_OF_MASKS_TOO = ("node.*.min_gaussians",)
+"""Floors that masks keep as well, where there are any."""
+
+
+def moments_to_keep(cfg: DictConfig) -> tuple[float, ...]:
+    """The moments of ``branch_points`` before which this run leaves a checkpoint: none once it has pruned itself.
+
+    A run of so many minutes has none: what a step is follows from the clock.
+    """
+    first = first_pruning(flat_config(resolved(cfg)))
+    return () if cfg.budget.minutes else tuple(moment for moment in cfg.branch_points if moment <= first)
+
+
+def first_pruning(config: Configuration) -> float:
+    """The fraction of a run at which something is pruned first; infinity: never."""
+    at = config.get("callback.pruning.at")
+    return min(at, default=math.inf) if isinstance(at, list) else math.inf
+
+
+def is_branch(config: Configuration, trunk: Configuration, moment: float) -> bool:
+    """Whether two runs have the same steps up to a moment: they differ in what is pruned from there on alone."""
+    late = all(moment <= first_pruning(one) for one in (config, trunk))
+    return late and identity_of_trunk(config) == identity_of_trunk(trunk)
+
+
+def identity_of_trunk(config: Configuration) -> tuple[str, ...]:
+    """What runs have in common whose steps are the same until one of them prunes."""
+    masked = any(value is True for key, value in config.items() if re.fullmatch(r"node\.\w+\.masked", key))
+    return identity_of_run(without(config, OF_PRUNING if masked else (*OF_PRUNING, *_OF_MASKS_TOO)))
+
+
+def check_resumed(config: dict[str, Any], start: Path) -> None:
+    """Raises ValueError, naming the options, where a run would go on with another configuration than its own.
+
+    From a checkpoint that was kept before a moment, another folder may prune otherwise from there on.
+    """
+    run, moment = run_of(start), checkpoint_fraction(start)
+    before, now = flat_config(resolved(load_run_config(run))), flat_config(config)
+    old, new = (without(flat, (*IDENTITY_KEYS, "trainer.*")) for flat in (before, now))
+    elsewhere = Path(str(now.get("out"))).resolve() != run.resolve()
+    if moment is not None and elsewhere and is_branch(new, old, moment):
+        old = new
+    changed = [key for key in sorted(old.keys() | new.keys()) if old.get(key) != new.get(key)]
+    if before.get("seed") != now["seed"]:
+        changed.insert(0, "seed")
+    if changed:
+        said = ", ".join(f"{key} ({old.get(key, before.get(key))} before)" for key in changed[:3])
+        raise ValueError(f"a run goes on as it began, but {len(changed)} options differ: {said}; start a new run")
+
+
+def start_from_trunk(cfg: DictConfig, out: Path) -> Path | None:
+    """Return the latest checkpoint of ``trunk`` that this run can begin with; None where there is none.
+
+    Of several processes each would look for itself, so a run that they share begins at step 0; ``resume=CHECKPOINT``
+    names one for all.
+    """
+    first = first_pruning(config := flat_config(resolved(cfg)))
+    if not cfg.trunk or cfg.overwrite or cfg.budget.minutes or math.isinf(first) or shares_a_run(cfg.trainer):
+        return None
+    run = Path(cfg.trunk)
+    if run.absolute() == out.absolute() or not is_whole(run) or (trunk := configuration_of(run)) is None:
+        return None
+    kept = {checkpoint_fraction(path): path for path in (run / "checkpoints").glob("before_*.ckpt")}
+    moment = max((one for one in kept if one is not None and one <= first), default=None)
+    if moment is None or not is_branch(config, trunk, moment):
+        return None
+    log.info("begins with %s, with which it has all steps up to there in common", kept[moment])
+    return kept[moment]

@@ -20,7 +20,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.config.compose import configuration, resolved, value_of, without_flags
+from sparsestreet.cli.config.compose import configuration, is_sweep, resolved, value_of, without_flags
 from sparsestreet.cli.config.resolvers import UNCOUNTED
 from sparsestreet.cli.config.validate import SHOWS, SWEEPS, flags_of
 from sparsestreet.cli.runs.folder import folder_problem, holds_same_run, is_whole, same_run
@@ -105,8 +105,8 @@ def job_problem(arguments: list[str]) -> str | None:
     """
     if not SWEEPS & flags_of(arguments) or any(key in text for text in arguments for key in _OTHER_SWEEPERS):
         return None
-    from sparsestreet.cli.config.assemble import recipe_of
     from sparsestreet.cli.config.validate import config_problem
+    from sparsestreet.cli.runs.run import recipe_of
 
     with configuration():
         jobs = list(jobs_of(without_flags(arguments)))
@@ -126,11 +126,6 @@ def job_problem(arguments: list[str]) -> str | None:
                 number = jobs.index(words) + 1
                 return f"job {number} of {len(jobs)} ({shown}): {problem}; nothing was trained"
     return None
-
-
-def is_sweep(text: str) -> bool:
-    """Whether an override asks for several jobs. Raises OverrideParseException for one that cannot be read."""
-    return OverridesParser.create().parse_overrides([text])[0].is_sweep_override()
 
 
 def note_of_sweep(arguments: list[str]) -> str | None:
@@ -179,7 +174,7 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> fl
     process is at. Where the folder holds another run, the whole sweep ends with status 2, so that nothing is written
     into that one.
     """
-    from sparsestreet.cli.config.assemble import this_command
+    from sparsestreet.cli.runs.run import this_command
 
     try:
         done = finished(cfg, out)
@@ -207,7 +202,7 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> fl
 
 def finished(cfg: DictConfig, out: Path) -> float | None:
     """The PSNR of a folder that holds the complete record of this very job; None where it has to be trained."""
-    from sparsestreet.cli.config.assemble import with_images
+    from sparsestreet.cli.runs.run import with_images
 
     try:
         summary = SUMMARY.read(out)

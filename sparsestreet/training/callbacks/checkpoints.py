@@ -31,7 +31,7 @@ class Checkpoints(Callback):
     """Writes ``last.ckpt`` every ``every`` steps and at the end, ``interrupted.ckpt`` on an exception or a signal.
 
     ``before`` holds fractions of the run: ``before_0.6.ckpt`` has the last step before what happens after 60 % of it,
-    and stays. Runs that differ only from there on can begin with it (``cli/runs/shared_prefix.py``).
+    and stays. Runs that differ only from there on can begin with it (``cli/runs/folder.py``).
 
     Each is written beside its place and renamed: whole or not at all, also on a full disk. Where a periodic one cannot
     be written, training goes on; where the last one cannot, the error is raised. It stands behind the callbacks that
