@@ -31,12 +31,10 @@ class Light:
 
     level: float
     """Of 255: the median image's mean gray level."""
-    level_error: float
     noise: float
     """Gray levels of 255, standard deviation from pixel to pixel: of the median image."""
     clipped: float
     """Share of cut-off pixels."""
-    clipped_error: float
     worst: float
     """Share of them in the image that has most, which is of ``worst_frame``."""
     worst_frame: int
@@ -74,18 +72,15 @@ def light_warnings(light: Light) -> Iterator[str]:
 
 
 def measured_light(frames: Frames) -> Light:
-    """Looks at a spread of the images. Errors are standard errors over images."""
+    """Return the light of a spread of the images."""
     places = spread(len(frames), MOST_FRAMES)
     rows = np.array([_of(frames[place]) for place in places])
     levels, noise, clipped = rows.T
-    worst, root = int(clipped.argmax()), np.sqrt(len(rows))
+    worst = int(clipped.argmax())
     return Light(
         float(np.median(levels)),
-        # Of a median of normal values, pi / 2 times the variance of the mean.
-        float(np.sqrt(np.pi / 2) * levels.std() / root),
         float(np.median(noise)),
         float(clipped.mean()),
-        float(clipped.std() / root),
         float(clipped[worst]),
         frames.views[places[worst]].indices[0],
         len(rows),
