@@ -12,8 +12,7 @@ import numpy as np
 from sparsestreet import load_scene
 from sparsestreet.export.video import side_by_side, write_pictures
 from sparsestreet.scene.edits import Edits
-from sparsestreet.serving.renderer import picture
-from sparsestreet.serving.scenes import RigOptions, open_run
+from sparsestreet.serving.renderer import RigOptions, open_run, picture
 
 STEP, WHEELBASE, AHEAD, BESIDE = 0.1, 2.8, 8.0, 0.5  # seconds, then meters; it keeps half a meter to the left
 

@@ -12,7 +12,7 @@ from sparsestreet.data.ply import read_ply
 from sparsestreet.files import read_npz, read_yaml
 from sparsestreet.pickles import read_pickled
 from sparsestreet.records.strict_json import read_text
-from sparsestreet.training.callbacks.checkpoints import step_of
+from sparsestreet.training.callbacks.files import step_of
 
 
 def names(folder) -> list[str]:

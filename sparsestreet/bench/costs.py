@@ -17,7 +17,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes import BackgroundSettings, Node
 from sparsestreet.scene.nodes.background import Background
-from sparsestreet.scene.options import DEFAULT_OPTIONS
+from sparsestreet.scene.state import DEFAULT_OPTIONS
 from sparsestreet.types import Shutter, View
 
 SCALES = (1.0, 2.0, 4.0)

@@ -18,7 +18,7 @@ from sparsestreet.bench.roofline import Floor, StepWork, floors, measured_bandwi
 from sparsestreet.bench.timing import TimeSpread, last_workspace, spread
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.scene.rendering import SceneRendering
-from sparsestreet.training.callbacks.phase_times import LOOP
+from sparsestreet.training.callbacks.times import LOOP
 from sparsestreet.training.system import StreetSystem
 
 

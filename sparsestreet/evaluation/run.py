@@ -38,9 +38,8 @@ from sparsestreet.records.summary import (
     clock_rows,
     summarize,
 )
-from sparsestreet.scene.centers import node_legend, project_centers
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.rendering import RenderOptions, node_legend, project_centers
 from sparsestreet.types import Frame, View
 
 MOST_IMAGES = 60

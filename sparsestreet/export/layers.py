@@ -21,9 +21,8 @@ from sparsestreet.export.path import CameraPath
 from sparsestreet.export.video import Picture, side_by_side
 from sparsestreet.ops import contribution, splat
 from sparsestreet.pictures.images import color_map
-from sparsestreet.scene.centers import node_legend
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import SceneRendering
+from sparsestreet.scene.rendering import SceneRendering, node_legend
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, View
 

@@ -12,10 +12,10 @@ from sparsestreet.atomic import atomic_file
 from sparsestreet.finite import check_finite
 from sparsestreet.geometry.quaternions import normalized
 from sparsestreet.scene.graph import SceneGaussians
+from sparsestreet.scene.loaded_scene import DAMAGED, check_numbers
 from sparsestreet.scene.nodes.node import Instances, Node
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
-from sparsestreet.scene.stored import DAMAGED, check_numbers
 from sparsestreet.types import Camera, Gaussians, View
 
 _ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)

@@ -20,10 +20,10 @@ from sparsestreet.geometry.cameras import project
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import Placement, RawGaussians
 from sparsestreet.ops.spherical_harmonics import view_colors
+from sparsestreet.scene.loaded_scene import DAMAGED, check_numbers
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
-from sparsestreet.scene.stored import DAMAGED, check_numbers
 from sparsestreet.types import Gaussians
 
 LOOKS = 12

@@ -5,13 +5,24 @@ one out). ``published`` has the rules of other papers, ``controls`` those that l
 number of each node, ``select`` drops rows by scores but respects the ``floors`` of a node and its instances.
 """
 
-from sparsestreet.pruning.controls import OpacityRule, RandomRule
-from sparsestreet.pruning.floors import Floors, InstanceAreas
-from sparsestreet.pruning.importance import Importance, measure_importance
-from sparsestreet.pruning.published import LightGaussianRule, MiniSplattingRule
-from sparsestreet.pruning.rule import PruningRule, RenderContext
+from sparsestreet.pruning.importance import (
+    Importance,
+    LightGaussianRule,
+    MiniSplattingRule,
+    OpacityRule,
+    RandomRule,
+    measure_importance,
+)
 from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
-from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
+from sparsestreet.pruning.select import (
+    Floors,
+    InstanceAreas,
+    PruningRule,
+    RenderContext,
+    keep_by_cost,
+    keep_by_importance,
+    keep_by_rank,
+)
 
 __all__ = [
     "Floors",

@@ -9,10 +9,19 @@ from torch import Tensor
 
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.ops import leave_one_out
-from sparsestreet.pruning.counts import Keep, check_keep, keep_counts
 from sparsestreet.pruning.importance import Importance
-from sparsestreet.pruning.rule import PruningRule, RenderContext, contributions, on_device
-from sparsestreet.pruning.select import keep_by_cost, keep_by_importance, keep_by_rank
+from sparsestreet.pruning.select import (
+    Keep,
+    PruningRule,
+    RenderContext,
+    check_keep,
+    contributions,
+    keep_by_cost,
+    keep_by_importance,
+    keep_by_rank,
+    keep_counts,
+    on_device,
+)
 from sparsestreet.scene.effects import linearized
 from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph

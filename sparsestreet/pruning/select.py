@@ -1,13 +1,157 @@
-"""Selects the rows of some nodes to keep, by importance or by cost, never fewer than their floors."""
+"""Which rows of a node a rule removes: floors, a rule's interface, the choice and the counts of many passes."""
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from sparsestreet.pruning.floors import Floors
-from sparsestreet.scene.gaussians import Selection, keep_best
+from sparsestreet.data.frame_cache import to_device
+from sparsestreet.ops import contribution
+from sparsestreet.ranks import ALONE, Ranks
+from sparsestreet.scene.gaussians import InstanceFloors, Selection, keep_best
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes import Node, NodeSettings
+from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions
+from sparsestreet.scene.state import FINISHED, SceneState
+from sparsestreet.types import Contribution, Frame
+
+
+class Floors(NamedTuple):
+    """The least numbers of rows of a node and its instances, as ``keep_best`` takes them.
+
+    >>> Floors(min_gaussians=100)
+    Floors(min_gaussians=100, instances=None)
+    """
+
+    min_gaussians: int
+    instances: InstanceFloors | None = None
+
+
+class InstanceAreas:
+    """Accumulates, view by view, the largest area that each instance of some nodes fills, and returns their floors.
+
+    The area is the sum of the blend weights of the instance's rows over the pixels: the visible area in pixels. An
+    object that is hidden, far or transparent in all views fills little and keeps little. One that fills anything keeps
+    at least one row.
+    """
+
+    def __init__(self, nodes: Mapping[str, Node]) -> None:
+        self._nodes = dict(nodes)
+        objects = {name: node.instances() for name, node in nodes.items() if node.settings.min_instance_gaussians > 0}
+        self._instances = {name: instances for name, instances in objects.items() if instances is not None}
+        self._pixels: dict[str, Tensor] = {
+            name: torch.zeros(len(each.names), dtype=torch.float64, device=each.ids.device)
+            for name, each in self._instances.items()
+        }
+
+    @property
+    def needed(self) -> bool:
+        """Whether any instance has a floor of its own."""
+        return bool(self._instances)
+
+    def add(self, view: Contribution, spans: Mapping[str, slice]) -> None:
+        """Adds one view of the whole scene; ``spans``: name of a node -> its rows."""
+        for name, instances in self._instances.items():
+            largest = self._pixels[name]
+            filled = torch.zeros_like(largest).index_add(0, instances.ids, view.weight[spans[name]].to(largest))
+            self._pixels[name] = torch.maximum(largest, filled)
+
+    def floors(self, ranks: Ranks = ALONE) -> dict[str, Floors]:
+        """Returns name of every node -> its floors, from the views of all ``ranks``.
+
+        Raises ValueError for an area that is not finite.
+        """
+        self._pixels = {name: ranks.largest(pixels) for name, pixels in self._pixels.items()}
+        return {
+            name: Floors(node.settings.min_gaussians, self._of_instances(name)) for name, node in self._nodes.items()
+        }
+
+    def _of_instances(self, name: str) -> InstanceFloors | None:
+        instances = self._instances.get(name)
+        if instances is None:
+            return None
+        pixels = self._pixels[name]
+        if not pixels.isfinite().all():
+            index = int((~pixels.isfinite()).nonzero()[0])
+            raise ValueError(
+                f"an instance fills a finite number of pixels, but {instances.names[index]!r} of node {name!r} fills "
+                f"{float(pixels[index])}: look for NaN in its Gaussians before pruning"
+            )
+        least = (self._nodes[name].settings.min_instance_gaussians * pixels / 1000).ceil().long()
+        return InstanceFloors(instances.ids, torch.minimum(least, instances.counts()))
+
+
+@dataclass(frozen=True)
+class RenderContext:
+    """How a rule renders the scene: with the state and options of training; and which pass of how many it is."""
+
+    state: SceneState = FINISHED
+    options: RenderOptions = DEFAULT_OPTIONS
+    passes: int = 1
+    """Number of passes of the run."""
+    passed: int = 0
+    """Number of passes before this one."""
+    ranks: Ranks = ALONE
+    """The processes that score together: each looks at its share of the views."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PruningRule(ABC):
+    """A rule that decides which rows of some nodes stay."""
+
+    nodes: Sequence[str] | None = None
+    """Names of the nodes that it may remove rows from, if they are ``prunable``; None: all prunable nodes."""
+
+    @abstractmethod
+    def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
+        """Returns name of every node that the rule touches -> the rows that stay, never fewer than its floors.
+
+        Computes no gradients. ``frames`` are all training views; each is read when it is indexed.
+        """
+
+    def touches(self, name: str, settings: NodeSettings) -> bool:
+        """Whether the rule may remove rows from a node."""
+        return settings.prunable and (self.nodes is None or name in self.nodes)
+
+    def areas(self, scene: SceneGraph) -> InstanceAreas:
+        """Returns an accumulator for the floors of all nodes that the rule touches."""
+        return InstanceAreas({name: node for name, node in scene.nodes.items() if self.touches(name, node.settings)})
+
+    def floors(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Floors]:
+        """Returns name of every node that the rule touches -> its floors; renders only if instances have floors.
+
+        A rule that needs ``contributions`` anyway adds them to its own ``areas`` instead.
+        """
+        areas = self.areas(scene)
+        if areas.needed:
+            for view, spans in contributions(scene, frames, context):
+                areas.add(view, spans)
+        return areas.floors(context.ranks)
+
+
+def on_device(scene: SceneGraph, frames: Sequence[Frame], ranks: Ranks = ALONE) -> Iterator[Frame]:
+    """Yields one frame of this process's share at a time, on the scene's device."""
+    return (to_device(frame, scene.device) for frame in ranks.share(frames))
+
+
+def contributions(
+    scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
+) -> Iterator[tuple[Contribution, dict[str, slice]]]:
+    """Yields for each view the contribution of every row of the whole scene, and name of a node -> its rows.
+
+    Of several processes each looks at its share of the views.
+    """
+    for frame in on_device(scene, frames, context.ranks):
+        placed = scene.gaussians_at(frame, context.state)
+        options = context.options
+        yield (
+            contribution(placed.gaussians, placed.view.camera, settings=options.settings, backend=options.backend),
+            placed.spans,
+        )
 
 
 def keep_by_importance(scores: Float[Tensor, " n"], floors: Floors) -> Selection:
@@ -81,3 +225,45 @@ def _keep_in_each(
     """Returns the rows that stay of each node; ``unwanted`` marks the rows of all nodes one after the other."""
     parts = unwanted.split([len(score) for score in scores.values()])
     return {name: keep_best(scores[name], part, *floors[name]) for name, part in zip(scores, parts, strict=True)}
+
+
+Keep = int | float | Mapping[str, int | float]
+"""One value for every node, or name of a node -> its value; a node without a value keeps all rows. Values up to 1 are
+fractions of the rows before the first pass; larger ones are numbers of rows."""
+
+
+def check_keep(keep: Keep) -> None:
+    """Raises ValueError for a value that is neither a fraction nor a number of rows."""
+    values = keep.values() if isinstance(keep, Mapping) else (keep,)
+    wrong = [value for value in values if not value >= 0]
+    if wrong:
+        raise ValueError(f"keep must be a fraction in [0, 1] or a number of Gaussians, got {wrong[0]}")
+
+
+def keep_counts(
+    scores: Mapping[str, Float[Tensor, " _"]], keep: Keep, floors: Mapping[str, Floors], context: RenderContext
+) -> dict[str, Selection]:
+    """Keeps so many rows of each node, those with the highest scores, or more if a floor demands it.
+
+    Of several passes each leaves the same share of a node's rows, and the last one leaves ``keep``. Among rows of equal
+    score the lower one stays. Raises ValueError for scores that are NaN, or a negative floor.
+
+    >>> import torch
+    >>> kept = keep_counts({"road": torch.tensor([0.1, 0.9, 0.5])}, 2, {"road": Floors(0)}, RenderContext())
+    >>> kept["road"].keep.tolist()
+    [False, True, True]
+    """
+    selections = {}
+    for name, floor in floors.items():
+        rows = len(scores[name])
+        going = rows - min(_count(keep, name, rows, context), rows)
+        selections |= keep_by_rank({name: scores[name]}, going, {name: floor})
+    return selections
+
+
+def _count(keep: Keep, name: str, rows: int, context: RenderContext) -> int:
+    value = keep.get(name, 1.0) if isinstance(keep, Mapping) else keep
+    if value <= 1:
+        return round(rows * value ** (1 / context.passes))
+    left = context.passes - context.passed
+    return round(rows * (value / max(rows, 1)) ** (1 / left))

@@ -1,6 +1,8 @@
-"""The progress of training, which a scene needs in addition to the view."""
+"""What a scene is asked for: the state of a node at an instant, and the options of parts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from sparsestreet.ops import SplatSettings
 
 
 @dataclass(frozen=True)
@@ -25,3 +27,14 @@ class SceneState:
 
 FINISHED = SceneState()
 """A scene whose training is over."""
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How a scene is rendered; training, pruning and evaluation take the same."""
+
+    settings: SplatSettings = field(default_factory=SplatSettings)
+    backend: str = "auto"
+
+
+DEFAULT_OPTIONS = RenderOptions()

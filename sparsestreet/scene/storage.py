@@ -15,14 +15,15 @@ from safetensors.torch import save_file
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.codec.container import MAGIC
-from sparsestreet.scene.stored import VERSION, StoredScene, description, scene_of, without_masks
-from sparsestreet.scene.street_file import SUFFIX, read_street
+from sparsestreet.records.run import RIG, RigRecord
+from sparsestreet.records.strict_json import decoded_json
+from sparsestreet.scene.loaded_scene import StoredScene, description, scene_of, without_masks
+from sparsestreet.scene.street_file import ATTACHED, SUFFIX, attached_file, read_street
+from sparsestreet.scene.views import VIEWS_FILE, RecordedViews, parsed_views, read_views
 
-__all__ = ["FILE_NAME", "SMALL_FILE_NAME", "VERSION", "StoredScene", "load_scene", "save_scene", "scene_path"]
-
-FILE_NAME = "scene.safetensors"
+SCENE_FILE = "scene.safetensors"
 """Name of the scene file in a run's folder."""
-SMALL_FILE_NAME = f"scene{SUFFIX}"
+STREET_FILE = f"scene{SUFFIX}"
 """Name of what may stand in its place there."""
 
 _KEY = "sparsestreet"
@@ -79,13 +80,13 @@ def scene_path(path: Path) -> Path:
 
     Raises FileNotFoundError where there is none, ValueError for a file of another kind, which it names.
     """
-    whole, small = path / FILE_NAME, path / SMALL_FILE_NAME
+    whole, small = path / SCENE_FILE, path / STREET_FILE
     found = path if not path.is_dir() else small if small.is_file() and not whole.is_file() else whole
     if not found.is_file():
-        runs = sorted(one.parent.name for one in path.glob(f"*/{FILE_NAME}"))[:3]
+        runs = sorted(one.parent.name for one in path.glob(f"*/{SCENE_FILE}"))[:3]
         there = f" (such as {', '.join(runs)} in it)" if runs else ""
         raise FileNotFoundError(
-            f"there is no scene at {found}: give a {FILE_NAME}, or the folder of a run that has one{there}"
+            f"there is no scene at {found}: give a {SCENE_FILE}, or the folder of a run that has one{there}"
         )
     _check_kind(found)
     return found
@@ -105,7 +106,7 @@ def _check_kind(path: Path) -> None:
     if what is None and path.suffix not in _OURS:
         what = "bytes that are not known" if head else "nothing"
     if what is not None:
-        raise ValueError(f"{path} holds {what}, not a scene: open the run's folder, its {FILE_NAME} or a {SUFFIX}")
+        raise ValueError(f"{path} holds {what}, not a scene: open the run's folder, its {SCENE_FILE} or a {SUFFIX}")
 
 
 def _check_tensors(path: Path) -> None:
@@ -115,7 +116,7 @@ def _check_tensors(path: Path) -> None:
     except SafetensorError:
         return  # who reads it says what is wrong
     if not ours:
-        raise ValueError(f"{path}: the file holds tensors but no scene of ours: give the {FILE_NAME} that a run wrote")
+        raise ValueError(f"{path}: the file holds tensors but no scene of ours: give the {SCENE_FILE} that a run wrote")
 
 
 def _read_scene(path: Path) -> StoredScene:
@@ -130,3 +131,47 @@ def _read_scene(path: Path) -> StoredScene:
         raise ValueError(f"{path} is no scene file or is damaged ({reason}): write it again") from error
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def views_of(scene: Path) -> RecordedViews:
+    """The recorded views of a scene: a run's folder, a scene file in it, or a .street that has them.
+
+    Raises FileNotFoundError where there are none, ValueError for damaged ones.
+    """
+    folder = scene if scene.is_dir() else scene.parent
+    if not scene.is_file() and (folder / VIEWS_FILE).is_file():
+        return read_views(folder / VIEWS_FILE)
+    packed = _attached(scene, VIEWS_FILE)
+    return read_views(folder / VIEWS_FILE) if packed is None else parsed_views(packed, f"{scene}: {VIEWS_FILE}")
+
+
+def rig_record(scene: Path) -> RigRecord | None:
+    """What is known of the recording car of a scene; None: nothing. Raises ValueError for a damaged record."""
+    folder = scene if scene.is_dir() else scene.parent
+    packed = _attached(scene, RIG.name)
+    return RIG.find(folder) if packed is None else decoded_json(packed, RigRecord, f"{scene}: {RIG.name}")
+
+
+def files_beside(scene: Path, views: Path | None = None) -> dict[str, bytes]:
+    """The files that go into a .street of a scene; ``views``: another file of views.
+
+    Raises FileNotFoundError where that file is not there.
+    """
+    folder = scene if scene.is_dir() else scene.parent
+    found = {}
+    for name in ATTACHED:
+        packed = _attached(scene, name)
+        if packed is not None:
+            found[name] = packed.encode("utf-8")
+        elif (folder / name).is_file():
+            found[name] = (folder / name).read_bytes()
+    return found if views is None else found | {VIEWS_FILE: views.read_bytes()}
+
+
+def _attached(scene: Path, name: str) -> str | None:
+    try:
+        file = scene_path(scene)
+    except FileNotFoundError:
+        return None
+    content = attached_file(file, name) if file.suffix == SUFFIX else None
+    return None if content is None else content.decode("utf-8", errors="replace")

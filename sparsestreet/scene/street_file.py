@@ -9,7 +9,7 @@ of each table; DATA, of each other tensor.
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,15 +17,150 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float64, Int16, Int64
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file
 from sparsestreet.codec.arrays import TYPES, Cursor, packed_column, unpacked_column
 from sparsestreet.codec.container import FrameReader, FrameWriter
-from sparsestreet.codec.gaussians import rows_in, unpacked_block
-from sparsestreet.codec.vectors import packed_axes, principal_axes, unpacked_axes
-from sparsestreet.scene import packing
-from sparsestreet.scene.stored import ROWS, StoredScene, check_numbers, description, scene_of, without_masks
+from sparsestreet.codec.gaussians import Block, Form, OtherColumn, Steps, packed_block, rows_in, unpacked_block
+from sparsestreet.codec.vectors import curve_order, fits, packed_axes, principal_axes, unpacked_axes
+from sparsestreet.scene.loaded_scene import ROWS, StoredScene, check_numbers, description, scene_of, without_masks
+from sparsestreet.scene.nodes import Background, Node, Rigid, Smpl, Vibrating
+
+BLOCK = 65_536
+"""Rows that are packed and unpacked at a time: what bounds memory beside the scene's own."""
+
+_POSITION_SHARE = 1 / 48
+"""Step of positions, in lower quartiles of the middle axis of a block's Gaussians."""
+_FLOAT32 = 2.0**-24
+"""Relative precision of float32: finer steps than this would keep its rounding."""
+_LIFE_SHARE = 1 / 64
+"""Step of life peaks, in lower quartiles of life spans."""
+
+_STANDARD = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
+_ELLIPSOIDS = (Background, Rigid, Smpl, Vibrating)
+"""Nodes in which an axis of a Gaussian has no name of its own: nothing is added to quaternions or scales."""
+
+
+def form_of(node: Node, axes: Mapping[int, Int16[np.ndarray, "d d"]]) -> Form:
+    """Returns how the node's rows are packed, with principal axes by the number of harmonics."""
+    size = 3 * (1 + node.rows.sh_rest.shape[1])
+    others = {
+        name: OtherColumn(str(column.dtype).removeprefix("torch."), tuple(column.shape[1:]), _step(node, name))
+        for name, column in sorted(node.rows.columns().items())
+        if name not in _STANDARD
+    }
+    return Form(axes[size], type(node) not in _ELLIPSOIDS, others)
+
+
+def packed_blocks(node: Node, form: Form) -> Iterator[list[bytes]]:
+    """Yields the node's rows, all of them finite: object by object, along a curve through each."""
+    columns = {name: column.detach().cpu() for name, column in node.rows.columns().items()}
+    means = columns["means"].double().numpy()
+    order = curve_order(means)
+    if "instances" in columns:
+        order = order[np.argsort(columns["instances"].numpy()[order], kind="stable")]
+    waiting = [order[start : start + BLOCK] for start in range(0, len(order), BLOCK)][::-1]
+    while waiting:
+        rows = waiting.pop()
+        step = _position_step(columns, rows)
+        if fits(means[rows], step):
+            yield packed_block(_block(columns, rows, form), form, Steps(step))
+        else:
+            waiting += [rows[len(rows) // 2 :], rows[: len(rows) // 2]]
+
+
+def columns_of(block: Block, form: Form) -> dict[str, Tensor]:
+    """Returns the columns of a block, float32 as they are learned."""
+    colors = torch.from_numpy(block.harmonics).float().reshape(len(block), len(form.axes) // 3, 3)
+    return {
+        "means": torch.from_numpy(block.means).float(),
+        "log_scales": torch.from_numpy(block.log_scales).float(),
+        "quaternions": torch.from_numpy(block.quaternions).float(),
+        "opacity_logits": torch.from_numpy(block.opacity_logits).float(),
+        "sh_dc": colors[:, :1].contiguous(),
+        "sh_rest": colors[:, 1:].contiguous(),
+        **{name: torch.from_numpy(np.array(block.others[name])) for name in form.others},
+    }
+
+
+def joined(blocks: list[dict[str, Tensor]], form: Form) -> dict[str, Tensor]:
+    """Returns the columns of all blocks, and empties them; those of a table without rows where there is none."""
+    if not blocks:
+        none = {name: np.zeros((0, *column.shape), column.dtype) for name, column in form.others.items()}
+        empty = Block(
+            np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, len(form.axes))), none
+        )
+        return columns_of(empty, form)
+    return {name: torch.cat([block.pop(name) for block in blocks]) for name in list(blocks[0])}
+
+
+def second_moments(nodes: Sequence[Node]) -> dict[int, Float64[np.ndarray, "d d"]]:
+    """Returns the second moments of all harmonics, weighted by opacity, by the number of harmonics of a row."""
+    sums: dict[int, Float64[np.ndarray, "d d"]] = {}
+    for node in nodes:
+        size = 3 * (1 + node.rows.sh_rest.shape[1])
+        total = sums.setdefault(size, np.zeros((size, size)))
+        for start in range(0, len(node.rows), BLOCK):
+            rows = slice(start, start + BLOCK)
+            colors = torch.cat([node.rows.sh_dc[rows], node.rows.sh_rest[rows]], dim=1).detach().double()
+            weights = torch.sigmoid(node.rows.opacity_logits[rows].detach().double())
+            flat = colors.flatten(1)
+            total += ((flat * weights[:, None]).T @ flat).cpu().numpy()
+    return sums
+
+
+def form_header(form: Form) -> dict[str, Any]:
+    """Returns what a file says of a form, but for its axes."""
+    others = {name: [column.dtype, list(column.shape), column.step] for name, column in form.others.items()}
+    return {"harmonics": len(form.axes), "named_axes": form.named_axes, "others": others}
+
+
+def form_from(header: Mapping[str, Any], axes: Mapping[int, Int16[np.ndarray, "d d"]]) -> Form:
+    """Returns the form that ``form_header`` described."""
+    others = {
+        name: OtherColumn(dtype, tuple(map(int, shape)), step)
+        for name, (dtype, shape, step) in header["others"].items()
+    }
+    return Form(axes[header["harmonics"]], bool(header["named_axes"]), others)
+
+
+def row_bytes(form: Form) -> int:
+    """Returns the bytes of a row once it is unpacked, before it is put into a table and after."""
+    return 16 * (11 + len(form.axes)) + sum(16 * math.prod(column.shape) for column in form.others.values())
+
+
+def _block(columns: Mapping[str, Tensor], rows: Int64[np.ndarray, " n"], form: Form) -> Block:
+    chosen = {name: column[torch.from_numpy(rows)] for name, column in columns.items()}
+    colors = torch.cat([chosen["sh_dc"], chosen["sh_rest"]], dim=1).flatten(1)
+    means, log_scales, quaternions, logits = (chosen[name].double().numpy() for name in _STANDARD[:4])
+    others = {name: chosen[name].numpy() for name in form.others}
+    return Block(means, log_scales, quaternions, logits, colors.double().numpy(), others)
+
+
+def _position_step(columns: Mapping[str, Tensor], rows: Int64[np.ndarray, " n"]) -> float:
+    chosen = torch.from_numpy(rows)
+    middle = columns["log_scales"][chosen].double().sort(1).values[:, 1].numpy()
+    largest = float(columns["means"][chosen].abs().max()) if len(rows) else 0.0
+    # A log scale beyond this belongs to no street, and its exponential is no number.
+    size = math.exp(min(float(np.quantile(middle, 0.25)), 50.0)) if len(rows) else 1.0
+    return max(_POSITION_SHARE * size, _FLOAT32 * largest, 1e-30)
+
+
+def _step(node: Node, name: str) -> float | None:
+    """Returns the step of a column that only some nodes have; None: it is kept bit for bit."""
+    if not isinstance(node, Vibrating) or not len(node.rows):
+        return None
+    if name == "velocities":
+        # The way from a life peak is at most velocity times cycle / 2 pi.
+        middle = node.rows.log_scales.detach().double().sort(1).values[:, 1].numpy()
+        return _POSITION_SHARE * math.exp(float(np.quantile(middle, 0.25))) * 2 * math.pi / node.settings.cycle
+    spans = node.rows.log_life_spans.detach().double().numpy()
+    if name == "life_peaks":
+        return _LIFE_SHARE * math.exp(float(np.quantile(spans, 0.25)))
+    return Steps.log_scale if name == "log_life_spans" else None
+
 
 SUFFIX = ".street"
 
@@ -47,19 +182,17 @@ def save_street(path: Path | str, stored: StoredScene, attached: Mapping[str, by
     """
     scene = without_masks(stored.scene)
     check_numbers(scene)
-    moments = packing.second_moments(list(scene.nodes.values()))
+    moments = second_moments(list(scene.nodes.values()))
     axes = {size: principal_axes(found) for size, found in sorted(moments.items())}
-    forms = {name: packing.form_of(node, axes) for name, node in scene.nodes.items()}
+    forms = {name: form_of(node, axes) for name, node in scene.nodes.items()}
     tensors = {name: value.detach().cpu().numpy() for name, value in scene.state_dict().items() if not _is_row(name)}
     files = dict(attached or {})
     header = {
         "scene": description(replace(stored, scene=scene)),
         "files": [[name, len(content)] for name, content in files.items()],
         "axes": list(axes),
-        "tables": {
-            name: {"rows": len(scene.nodes[name].rows), **packing.form_header(form)} for name, form in forms.items()
-        },
-        "tensors": {name: [value.dtype.name, list(value.shape), _step(name)] for name, value in tensors.items()},
+        "tables": {name: {"rows": len(scene.nodes[name].rows), **form_header(form)} for name, form in forms.items()},
+        "tensors": {name: [value.dtype.name, list(value.shape), _step_of_sky(name)] for name, value in tensors.items()},
     }
     with atomic_file(Path(path)) as temporary, temporary.open("wb") as file, FrameWriter(file) as frames:
         frames.write("HEAD", [json.dumps(header, allow_nan=False).encode()])
@@ -69,12 +202,12 @@ def save_street(path: Path | str, stored: StoredScene, attached: Mapping[str, by
         for found in axes.values():
             frames.write("AXES", [packed_axes(found)])
         for name, form in forms.items():
-            for block in packing.packed_blocks(scene.nodes[name], form):
+            for block in packed_blocks(scene.nodes[name], form):
                 frames.write("ROWS", block)
         for name, value in tensors.items():
             flat = value.reshape(-1, _width(value.shape))
             for start in range(0, len(flat), _rows_of(flat.shape[1])):
-                frames.write("DATA", packed_column(flat[start : start + _rows_of(flat.shape[1])], _step(name)))
+                frames.write("DATA", packed_column(flat[start : start + _rows_of(flat.shape[1])], _step_of_sky(name)))
 
 
 def read_street(path: Path) -> StoredScene:
@@ -121,19 +254,19 @@ def _read_file(frames: FrameReader, size: int) -> bytes:
 
 
 def _read_table(frames: FrameReader, table: Mapping[str, Any], axes: Mapping[int, np.ndarray]) -> dict[str, Tensor]:
-    form, rows = packing.form_from(table, axes), _count(table["rows"])
+    form, rows = form_from(table, axes), _count(table["rows"])
     blocks: list[dict[str, Tensor]] = []
     found = 0
     while found < rows:
         content = frames.read("ROWS")
         count = rows_in(content)
-        if not 0 < count <= min(rows - found, packing.BLOCK):
+        if not 0 < count <= min(rows - found, BLOCK):
             raise ValueError(f"a block has {count} rows where {rows - found} are left: it is damaged")
-        frames.budget.take(count * packing.row_bytes(form))
+        frames.budget.take(count * row_bytes(form))
         # As float32 at once: blocks are in double precision.
-        blocks.append(packing.columns_of(unpacked_block(content, form), form))
+        blocks.append(columns_of(unpacked_block(content, form), form))
         found += count
-    return packing.joined(blocks, form)
+    return joined(blocks, form)
 
 
 def _read_tensor(frames: FrameReader, dtype: str, shape: tuple[int, ...], step: float | None) -> Tensor:
@@ -155,7 +288,7 @@ def _is_row(name: str) -> bool:
     return name.startswith("nodes.") and name.split(".", 2)[2].startswith(ROWS)
 
 
-def _step(name: str) -> float | None:
+def _step_of_sky(name: str) -> float | None:
     return _SKY_STEP if name.startswith("effects.") and name.endswith(_SKY) else None
 
 

@@ -14,7 +14,7 @@ from sparsestreet.records.strict_json import EXACT, decoded_json, json_line, rea
 from sparsestreet.types import Camera, Shutter, Side, View
 
 FORMAT = 2
-FILE_NAME = "views.json"
+VIEWS_FILE = "views.json"
 """Name of the file in a run's folder."""
 
 DEFAULT_FRAME_RATE = 10.0
@@ -118,7 +118,7 @@ def read_views(path: Path | str) -> RecordedViews:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"there is no {path}: training writes a {FILE_NAME} into the folder of its run")
+        raise FileNotFoundError(f"there is no {path}: training writes a {VIEWS_FILE} into the folder of its run")
     return parsed_views(read_text(path), str(path))
 
 

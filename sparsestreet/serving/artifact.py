@@ -20,13 +20,11 @@ from scipy.spatial.transform import Rotation
 import sparsestreet
 from sparsestreet.atomic import atomic_file
 from sparsestreet.scene.edits import objects_of
+from sparsestreet.scene.loaded_scene import check_numbers
 from sparsestreet.scene.nodes.tracked import Tracked
-from sparsestreet.scene.stored import check_numbers
 from sparsestreet.scene.views import RecordedViews
-from sparsestreet.serving.cameras import Pose
-from sparsestreet.serving.renderer import frame_from_box
-from sparsestreet.serving.rig import Rig, RigCamera
-from sparsestreet.serving.scenes import ServedScene
+from sparsestreet.serving.cameras import Pose, Rig, RigCamera
+from sparsestreet.serving.renderer import ServedScene, frame_from_box
 
 DEFAULT_CAR = (4.8, 1.9, 1.6)
 """Length, width, height of the vehicle, meters; the rear axle is 1 m before its rear end."""

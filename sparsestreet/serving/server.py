@@ -20,10 +20,17 @@ from sparsestreet.demand import as_demand
 from sparsestreet.listening import address, check_address
 from sparsestreet.records.run import this_source
 from sparsestreet.serving import wire
-from sparsestreet.serving.cameras import NotServedError, camera_spec, pose_message
-from sparsestreet.serving.renderer import Picture, edits_of, encoded, picture, view_of
-from sparsestreet.serving.scenes import Scenes, ServedScene, UnknownSceneError
-from sparsestreet.serving.turns import Turns
+from sparsestreet.serving.cameras import NotServedError, Turns, camera_spec, pose_message
+from sparsestreet.serving.renderer import (
+    Picture,
+    Scenes,
+    ServedScene,
+    UnknownSceneError,
+    edits_of,
+    encoded,
+    picture,
+    view_of,
+)
 from sparsestreet.types import View
 
 log = logging.getLogger(__name__)

@@ -44,11 +44,9 @@ from sparsestreet.training.callbacks import (
     newest_checkpoint,
     step_of,
 )
-from sparsestreet.training.costs import record_costs
-from sparsestreet.training.curves import kept_curves
-from sparsestreet.training.identity import RunIdentity
+from sparsestreet.training.forecast import kept_curves, record_costs
 from sparsestreet.training.lightning import check_images, end_after, images_per_step, is_dev_run, ranks_of, steps_for
-from sparsestreet.training.recipe import Recipe
+from sparsestreet.training.recipe import Recipe, RunIdentity
 from sparsestreet.training.system import StreetSystem
 
 log = logging.getLogger(__name__)

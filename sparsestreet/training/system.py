@@ -16,7 +16,6 @@ from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
-from sparsestreet.training.finite import LossWatch
 from sparsestreet.training.lightning import (
     ends_step,
     image_number,
@@ -26,11 +25,9 @@ from sparsestreet.training.lightning import (
 )
 from sparsestreet.training.losses import Loss, without_hood
 from sparsestreet.training.moved_views import MovedViewTerm
+from sparsestreet.training.nonfinite import LossWatch, Quarantine, SaidLater
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
-from sparsestreet.training.quarantine import Quarantine
-from sparsestreet.training.resolution import ResolutionSchedule
-from sparsestreet.training.said_later import SaidLater
-from sparsestreet.training.schedule import Course
+from sparsestreet.training.schedule import Course, ResolutionSchedule
 from sparsestreet.types import Frame, View
 
 

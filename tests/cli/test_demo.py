@@ -14,7 +14,7 @@ from sparsestreet.cli.commands import demo as module
 from sparsestreet.cli.commands.demo import demo
 from sparsestreet.pictures.images import KINDS, picture_path, write_png
 from sparsestreet.records.summary import HELD_OUT, QUALITY, SUMMARY
-from sparsestreet.scene.centers import node_legend
+from sparsestreet.scene.rendering import node_legend
 from tests.evaluation.frames import disturbed, make_image, make_summary
 
 TITLES = ["plain", "the paper's method (short)", "ours"]

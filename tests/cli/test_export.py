@@ -13,7 +13,7 @@ from plyfile import PlyData
 from sparsestreet.cli.commands.export import export
 from sparsestreet.cli.commands.render import render
 from sparsestreet.export.ply import scene_gaussians
-from sparsestreet.scene.effects.lens import Lens, LensSettings
+from sparsestreet.scene.effects.optics import Lens, LensSettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views

@@ -28,7 +28,7 @@ from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.initialize.coverage import Coverage
+from sparsestreet.scene.initialize.training_data import Coverage
 from sparsestreet.scene.masks import MaskScope, StaticMask
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.scene.rendering import render as rendered

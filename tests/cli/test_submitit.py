@@ -17,7 +17,7 @@ from submitit.local.local import LOCAL_REQUEUE_RETURN_CODE, LocalJobEnvironment
 
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.training.callbacks import Checkpoints, GracefulStop
-from sparsestreet.training.callbacks.graceful_stop import SIGNALS
+from sparsestreet.training.callbacks.files import SIGNALS
 from tests.cli.conftest import ALL_STAGES
 from tests.training.callbacks.test_graceful_stop import STEPS, Sends
 from tests.training.stubs import background, fit, frame_at, make_system

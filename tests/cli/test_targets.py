@@ -88,7 +88,7 @@ def test_nothing_that_a_received_run_names_is_made_by_any_command(tmp_path, monk
     for name in ("instantiate", "_locate"):
         monkeypatch.setattr(targets, name, lambda *given, **_: pytest.fail(f"{given} was made"))
     monkeypatch.setattr("sparsestreet.scene.storage.load_scene", lambda *given: pytest.fail("it was opened"))
-    monkeypatch.setattr("sparsestreet.serving.scenes.Scenes.rig", lambda *given: SimpleNamespace(cameras=()))
+    monkeypatch.setattr("sparsestreet.serving.renderer.Scenes.rig", lambda *given: SimpleNamespace(cameras=()))
     mark = tmp_path / "it_ran"
     for number, part in enumerate(attacks(str(mark)) * 3):
         wrap = WRAPPED[(number + number // len(WRAPPED)) % len(WRAPPED)]

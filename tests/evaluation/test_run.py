@@ -20,8 +20,7 @@ from sparsestreet.pictures.images import picture_path
 from sparsestreet.records.costs import COSTS, NodeCost
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import HELD_OUT, LATENCY, QUALITY, SUMMARY, TRAINING, clock_rows, summarize
-from sparsestreet.scene.centers import node_legend
-from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.rendering import RenderOptions, node_legend
 from sparsestreet.types import View
 from tests.evaluation.dark import MADE, darker, evaluate, make_frames
 from tests.evaluation.frames import NOISE, make_frame, make_latency

@@ -9,7 +9,7 @@ from sparsestreet.evaluation import run as run_module
 from sparsestreet.evaluation.run import choose_pictures
 from sparsestreet.pictures.images import LIDAR_END, read_pictures
 from sparsestreet.records.summary import HELD_OUT, RegionQuality
-from sparsestreet.scene.centers import node_legend
+from sparsestreet.scene.rendering import node_legend
 from tests.evaluation.dark import MADE, evaluate, make_frames
 from tests.evaluation.frames import make_frame, make_image
 

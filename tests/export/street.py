@@ -12,7 +12,7 @@ from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
-from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
+from sparsestreet.scene.nodes.tracked import Rigid, RigidSettings
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import Camera, View

@@ -12,7 +12,7 @@ from sparsestreet.pictures.images import Dots, Marked, Places
 from sparsestreet.pictures.plots import draw_evidence, draw_history, plot_counts, plot_psnr, plot_runs
 from sparsestreet.records.curves import LEDGER, MASK, PRUNING, CountChange
 from sparsestreet.records.run import RUN
-from sparsestreet.training.callbacks import mask_training, pruning
+from sparsestreet.training.callbacks import sparsify
 from tests.evaluation.frames import make_run
 
 pytestmark = pytest.mark.lengthy
@@ -151,7 +151,7 @@ def test_counts_stay_between_changes_and_events_are_marked(tmp_path, drawn_histo
 
 
 def test_the_callbacks_give_the_reasons_that_are_marked():
-    assert set(plots.MARKED) == {mask_training.REASON, pruning.REASON}
+    assert set(plots.MARKED) == {sparsify.MASKED, sparsify.PRUNED}
 
 
 def test_psnr_is_taken_where_it_was_logged(tmp_path, drawn_history):

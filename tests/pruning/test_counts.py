@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sparsestreet.pruning import Floors, ImportanceRule, LeaveOneOutRule, RenderContext
-from sparsestreet.pruning.counts import keep_counts
+from sparsestreet.pruning.select import keep_counts
 from tests.pruning.test_rules import CONTEXT, frame_of, scene_of
 
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-import sparsestreet.pruning.rule as rule_module
+import sparsestreet.pruning.select as rule_module
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.pruning import ImportanceRule, InstanceAreas, LeaveOneOutRule, OpacityRule, RandomRule, RenderContext
 from sparsestreet.scene.gaussians import Rows

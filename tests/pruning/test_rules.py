@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from sparsestreet.pruning import Floors, ImportanceRule, LeaveOneOutRule, PruningRule, RenderContext
-from sparsestreet.pruning.rule import contributions
+from sparsestreet.pruning.select import contributions
 from sparsestreet.scene.effects import Effect, LensSettings, Sky, SkySettings
 from sparsestreet.scene.gaussians import Rows, Selection
 from sparsestreet.scene.graph import SceneGraph

@@ -13,11 +13,10 @@ from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.scene.assignment import assign_tracks
+from sparsestreet.scene.build import assign_tracks
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.coverage import Coverage
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
-from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.initialize.training_data import Coverage, TrainingData
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import Mask, StaticMask, StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, NodeSettings, Rigid, RigidSettings

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.scene.assignment import Assignment, assign_tracks
+from sparsestreet.scene.build import Assignment, assign_tracks
 from sparsestreet.types import Track
 from tests.scene.street import background_settings, pose, rigid_settings, track
 

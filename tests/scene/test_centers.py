@@ -1,9 +1,9 @@
 import torch
 
-from sparsestreet.scene.centers import BACKGROUND_COLOR, NODE_COLORS, project_centers
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Background
+from sparsestreet.scene.rendering import BACKGROUND_COLOR, NODE_COLORS, project_centers
 from tests.scene.street import background, camera_at, view_at
 
 

@@ -13,8 +13,8 @@ import torch
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.effects import SkySettings
-from sparsestreet.scene.encoding import CLASS, decode, decode_as, encode
 from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.loaded_scene import CLASS, decode, decode_as, encode
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import BackgroundSettings
 from tests.scene.street import background_settings
@@ -116,7 +116,11 @@ def test_a_file_cannot_make_the_program_import(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_functions_and_plain_classes_are_no_settings():
-    for name in ("sparsestreet.scene.encoding:encode", "sparsestreet.scene.effects.sky:Sky", "sparsestreet.ops:splat"):
+    for name in (
+        "sparsestreet.scene.loaded_scene:encode",
+        "sparsestreet.scene.effects.sky:Sky",
+        "sparsestreet.ops:splat",
+    ):
         with pytest.raises(ValueError, match="as settings, but that is no dataclass"):
             decode({CLASS: name})
 

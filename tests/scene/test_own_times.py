@@ -8,8 +8,8 @@ import torch
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.quaternions import slerp
-from sparsestreet.scene.body.people import _filled
-from sparsestreet.scene.initialize.boxes import lidar_in_boxes, outside_boxes
+from sparsestreet.scene.body import _filled
+from sparsestreet.scene.initialize.gaussians import lidar_in_boxes, outside_boxes
 from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.types import Track

@@ -13,7 +13,7 @@ import torch
 import sparsestreet
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.rendering import RenderOptions, render
-from sparsestreet.scene.storage import FILE_NAME, StoredScene, load_scene, save_scene
+from sparsestreet.scene.storage import SCENE_FILE, StoredScene, load_scene, save_scene
 from sparsestreet.types import Frame
 from tests.scene.stored import NAMES, background, cars, pixels, stored, view, with_nodes
 
@@ -21,8 +21,8 @@ TIMES = [0.0, 0.25, 0.37, 1.0]
 
 
 def reopened(path: Path, scene: StoredScene) -> StoredScene:
-    save_scene(path / FILE_NAME, scene)
-    return load_scene(path / FILE_NAME)
+    save_scene(path / SCENE_FILE, scene)
+    return load_scene(path / SCENE_FILE)
 
 
 def header_of(path: Path) -> dict:
@@ -129,11 +129,11 @@ def test_options_come_back_to_the_last_bit(tmp_path: Path, settings: SplatSettin
     options = RenderOptions(settings, "reference")
     assert reopened(tmp_path, replace(stored(), options=options)).options == options
     # Other programs read the header, too: no NaN and no Infinity in it.
-    assert header_of(tmp_path / FILE_NAME)["num_frames"] == 5
+    assert header_of(tmp_path / SCENE_FILE)["num_frames"] == 5
 
 
 def test_the_scene_goes_to_the_device_that_is_asked_for(tmp_path: Path):
-    save_scene(tmp_path / FILE_NAME, stored())
+    save_scene(tmp_path / SCENE_FILE, stored())
     scene = load_scene(tmp_path, "meta").scene  # a device that every machine has
     tensors = [*scene.parameters(), *scene.buffers()]
     assert {tensor.device.type for tensor in tensors} == {"meta"}
@@ -142,21 +142,21 @@ def test_the_scene_goes_to_the_device_that_is_asked_for(tmp_path: Path):
 
 def test_a_run_folder_stands_for_its_scene(tmp_path: Path):
     scene = stored()
-    save_scene(tmp_path / "runs" / "first" / FILE_NAME, scene)
+    save_scene(tmp_path / "runs" / "first" / SCENE_FILE, scene)
     assert [path.name for path in (tmp_path / "runs" / "first").iterdir()] == ["scene.safetensors"]
     loaded = sparsestreet.load_scene(str(tmp_path / "runs" / "first"))
     assert all(map(torch.equal, pixels(loaded.render(view())), pixels(scene.render(view()))))
 
 
 def test_a_file_is_written_again_over_the_old_one(tmp_path: Path):
-    save_scene(tmp_path / FILE_NAME, stored())
-    first = (tmp_path / FILE_NAME).read_bytes()
+    save_scene(tmp_path / SCENE_FILE, stored())
+    first = (tmp_path / SCENE_FILE).read_bytes()
     loaded = reopened(tmp_path, replace(stored(3), name="another"))
     assert loaded.name == "another"
     assert loaded.scene.nodes["road"].rows.sh_rest.shape == (30, 15, 3)
     # The same scene is the same file.
-    save_scene(tmp_path / FILE_NAME, stored())
-    assert (tmp_path / FILE_NAME).read_bytes() == first
+    save_scene(tmp_path / SCENE_FILE, stored())
+    assert (tmp_path / SCENE_FILE).read_bytes() == first
 
 
 IN_A_NEW_PROCESS = """
@@ -178,7 +178,7 @@ torch.save([(image.rgb, image.alpha, image.depth) for image in images], sys.argv
 def test_a_new_process_shows_the_same_from_a_folder_that_was_moved(tmp_path: Path, backend: str):
     """Nothing but the file: no log, no configuration, no folder that it was written in."""
     scene = replace(stored(3, masked=True), options=RenderOptions(SplatSettings(eps2d=0.31), backend))
-    save_scene(tmp_path / "written" / FILE_NAME, scene)
+    save_scene(tmp_path / "written" / SCENE_FILE, scene)
     camera = vars(view().camera) | {"times": TIMES}
     torch.save({k: v for k, v in camera.items() if v is not None}, tmp_path / "camera.pt")
     (tmp_path / "written").rename(tmp_path / "moved")

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from sparsestreet.scene.effects import Effect
-from sparsestreet.scene.effects.motion_blur import MotionBlur, MotionBlurSettings
+from sparsestreet.scene.effects.optics import MotionBlur, MotionBlurSettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene

@@ -20,15 +20,16 @@ from safetensors.torch import save_file
 from sparsestreet.codec.container import MAGIC
 from sparsestreet.scene import storage
 from sparsestreet.scene.density import GradientDensity
-from sparsestreet.scene.storage import FILE_NAME, VERSION, load_scene, save_scene
+from sparsestreet.scene.loaded_scene import VERSION
+from sparsestreet.scene.storage import SCENE_FILE, load_scene, save_scene
 from tests.scene.stored import pixels, stored, view
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     """A good scene file."""
-    save_scene(tmp_path / FILE_NAME, stored())
-    return tmp_path / FILE_NAME
+    save_scene(tmp_path / SCENE_FILE, stored())
+    return tmp_path / SCENE_FILE
 
 
 def rewritten(path: Path, change: Callable[[dict, dict], object]) -> None:
@@ -41,9 +42,9 @@ def rewritten(path: Path, change: Callable[[dict, dict], object]) -> None:
 
 
 def test_no_file(tmp_path: Path):
-    with pytest.raises(FileNotFoundError, match=f"there is no scene at .*{FILE_NAME}: give a {FILE_NAME}, or"):
-        load_scene(tmp_path / FILE_NAME)
-    with pytest.raises(FileNotFoundError, match=f"there is no scene at {tmp_path}/{FILE_NAME}"):
+    with pytest.raises(FileNotFoundError, match=f"there is no scene at .*{SCENE_FILE}: give a {SCENE_FILE}, or"):
+        load_scene(tmp_path / SCENE_FILE)
+    with pytest.raises(FileNotFoundError, match=f"there is no scene at {tmp_path}/{SCENE_FILE}"):
         load_scene(tmp_path)
 
 
@@ -82,7 +83,7 @@ def test_files_of_other_programs_are_named_for_what_they_are(name: str, tmp_path
     with pytest.raises(ValueError, match=re.escape(f"{tmp_path / name} {said}")) as found:
         load_scene(tmp_path / name)
     assert "damaged" not in str(found.value)
-    assert said.startswith("is a") or f"open the run's folder, its {FILE_NAME} or a .street" in str(found.value)
+    assert said.startswith("is a") or f"open the run's folder, its {SCENE_FILE} or a .street" in str(found.value)
 
 
 def test_a_folder_of_runs_says_so(path: Path, tmp_path: Path):
@@ -95,7 +96,7 @@ def test_tensors_of_another_program(path: Path):
     for metadata in (None, {"format": "pt"}):
         save_file({"weight": torch.zeros(3)}, path, metadata=metadata)
         with pytest.raises(
-            ValueError, match=f"{path}: the file holds tensors but no scene of ours: give the {FILE_NAME}"
+            ValueError, match=f"{path}: the file holds tensors but no scene of ours: give the {SCENE_FILE}"
         ):
             load_scene(path)
 
@@ -258,7 +259,7 @@ def test_a_write_that_the_system_refuses(path: Path):
 def test_a_first_write_that_fails_leaves_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(storage, "save_file", half_written)
     with pytest.raises(OSError, match="No space left"):
-        save_scene(tmp_path / FILE_NAME, stored())
+        save_scene(tmp_path / SCENE_FILE, stored())
     assert list(tmp_path.iterdir()) == []
 
 

@@ -17,13 +17,12 @@ import zstandard
 import sparsestreet
 from sparsestreet.codec import container
 from sparsestreet.codec.container import FrameReader, FrameWriter
-from sparsestreet.scene import packing
-from sparsestreet.scene.beside import rig_record, views_of
+from sparsestreet.scene import street_file
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import StaticMaskSettings, TemporalMaskSettings
 from sparsestreet.scene.nodes import Background
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
+from sparsestreet.scene.storage import StoredScene, load_scene, rig_record, save_scene, views_of
 from sparsestreet.scene.street_file import attached_file, save_street
 from sparsestreet.scene.views import write_views
 from tests.export.street import street_views
@@ -121,7 +120,7 @@ def test_tables_of_all_sizes(tmp_path: Path, rows: int):
 
 
 def test_memory_is_that_of_a_block_beside_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(packing, "BLOCK", 500)
+    monkeypatch.setattr(street_file, "BLOCK", 500)
     node = background(5_000, 0, sh_degree=3)
     scene = scene_of(road=node)
     one = node.row_bytes() // len(node.rows)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sparsestreet.scene.vibration import displacements, faded_logits, mean_velocities
+from sparsestreet.scene.density.vibrating import displacements, faded_logits, mean_velocities
 
 CYCLE = 0.2
 

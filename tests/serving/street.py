@@ -13,7 +13,7 @@ from sparsestreet.scene.storage import load_scene, save_scene
 from sparsestreet.scene.views import write_views
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import camera_spec, pose_message
-from sparsestreet.serving.scenes import RigOptions, ServedScene, open_run
+from sparsestreet.serving.renderer import RigOptions, ServedScene, open_run
 from sparsestreet.types import Camera, View
 from tests.export.street import stored_street, street_views
 

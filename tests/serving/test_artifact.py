@@ -13,9 +13,8 @@ from scipy.spatial.transform import Rotation
 from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.artifact import Provenance, write_artifact
-from sparsestreet.serving.renderer import edits_of, picture, view_of
-from sparsestreet.serving.rig import rig_of
-from sparsestreet.serving.scenes import ServedScene
+from sparsestreet.serving.cameras import rig_of
+from sparsestreet.serving.renderer import ServedScene, edits_of, picture, view_of
 from sparsestreet.types import Shutter
 from tests.export.street import stored_street, street_views
 from tests.serving.street import START_US, STEP_US, place, request_for, served, timed_views

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from sparsestreet.scene.storage import load_scene
-from sparsestreet.serving.scenes import Scenes, named_runs
+from sparsestreet.serving.renderer import Scenes, named_runs
 from sparsestreet.serving.server import start
 from tests.conftest import unchecked
 from tests.serving.street import write_run

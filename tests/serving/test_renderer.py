@@ -16,8 +16,7 @@ from sparsestreet.scene.storage import StoredScene
 from sparsestreet.serving import wire
 from sparsestreet.serving.artifact import box_center
 from sparsestreet.serving.cameras import NotServedError, pose_message
-from sparsestreet.serving.renderer import edits_of, encoded, picture, view_of
-from sparsestreet.serving.scenes import ServedScene
+from sparsestreet.serving.renderer import ServedScene, edits_of, encoded, picture, view_of
 from tests.export.street import stored_street
 from tests.scene.people import smpl, walker
 from tests.serving.street import START_US, as_sent, at, place, request_for, served, timed_views, world_from_camera

@@ -7,12 +7,11 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from sparsestreet.scene.effects import LensSettings, ShutterSettings
-from sparsestreet.scene.effects.lens import Pinhole
-from sparsestreet.scene.effects.shutter import GlobalShutter
+from sparsestreet.scene.effects.optics import GlobalShutter, Pinhole
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.scene.street_file import ATTACHED, save_street
-from sparsestreet.serving.scenes import Scenes, UnknownSceneError, named_runs
+from sparsestreet.serving.renderer import Scenes, UnknownSceneError, named_runs
 from tests.serving.street import write_run
 
 

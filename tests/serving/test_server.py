@@ -17,7 +17,7 @@ from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.serving import renderer, wire
 from sparsestreet.serving import server as server_module
-from sparsestreet.serving.scenes import Scenes, named_runs
+from sparsestreet.serving.renderer import Scenes, named_runs
 from sparsestreet.serving.server import start
 from tests.export.street import stored_street
 from tests.serving.client import Client, common_pb2, pb2, theirs

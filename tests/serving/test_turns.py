@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from sparsestreet.serving.turns import Turns
+from sparsestreet.serving.cameras import Turns
 
 
 def wait_for(condition) -> None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from sparsestreet.training.callbacks.checkpoints import step_of
+from sparsestreet.training.callbacks.files import step_of
 from sparsestreet.triangulation import street
 from tests.cli.test_killed_sweep import content
 from tests.data.damage import Damage, cut, written

@@ -27,11 +27,11 @@ from sparsestreet.data.ply import read_ply
 from sparsestreet.evaluation.evaluate import Predictions
 from sparsestreet.files import read_npz, read_yaml
 from sparsestreet.pickles import read_pickled
-from sparsestreet.scene.body.smpl_file import SmplFile
+from sparsestreet.scene.body import SmplFile
 from sparsestreet.scene.edits import read_edits
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.scene.views import read_views
-from sparsestreet.training.callbacks.checkpoints import step_of
+from sparsestreet.training.callbacks.files import step_of
 from tests.data.damage import Damage, long, written
 from tests.stress.forked import Forked, command
 from tests.stress.runs import MORE_MB, assert_refused, contents, cut_short, on_drive, street_of

@@ -23,7 +23,7 @@ from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import SampledMaskSettings, StaticMaskSettings
 from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid, RigidSettings
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.training.callbacks.resizing import RowListener
+from sparsestreet.training.callbacks.density_control import RowListener
 from sparsestreet.training.losses import Loss, Photometric
 from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings

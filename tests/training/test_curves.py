@@ -11,7 +11,7 @@ from lightning.pytorch.loggers import CSVLogger
 
 from sparsestreet.records.curves import LOGGED, Logged
 from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
-from sparsestreet.training.curves import kept_curves
+from sparsestreet.training.forecast import kept_curves
 from sparsestreet.training.run import CPU_TRAINER, fit
 from tests.conftest import unchecked
 from tests.training.parallel.street import data, system

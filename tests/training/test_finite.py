@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from sparsestreet.host_copy import HostCopy
-from sparsestreet.training import finite
+from sparsestreet.training import nonfinite
 from sparsestreet.training.callbacks import Checkpoints, step_of
-from sparsestreet.training.finite import LossWatch, NotFiniteError, not_finite
+from sparsestreet.training.nonfinite import LossWatch, NotFiniteError, not_finite
 from tests.scene.street import frame_at
 from tests.training.stubs import StubTrainer, background, make_system
 
@@ -39,7 +39,7 @@ class Late(torch.Tensor):
 
 def test_on_a_device_a_loss_is_looked_at_one_step_later(system, monkeypatch):
     """What arrives is read at the next look, and when somebody settles; nothing is read twice."""
-    monkeypatch.setattr(finite, "copy_to_host", lambda values: HostCopy(values.as_subclass(torch.Tensor), None))
+    monkeypatch.setattr(nonfinite, "copy_to_host", lambda values: HostCopy(values.as_subclass(torch.Tensor), None))
     values = {kind: torch.tensor([1.0, value]).as_subclass(Late) for kind, value in (("fine", 2.0), ("bad", torch.nan))}
     watch = LossWatch()
     watch.look(("a", "b"), values["fine"], system.scene, frame_at(1), 1)

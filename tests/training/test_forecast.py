@@ -21,8 +21,7 @@ from sparsestreet.training.forecast import (
     size_in_words,
 )
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
-from sparsestreet.training.moved_views.returns import StreetReturns
-from sparsestreet.training.moved_views.target import Returns
+from sparsestreet.training.moved_views.returns import Returns, StreetReturns
 from tests.training.stubs import SplitFrames, StubTrainer, background, frame_at, make_system, rigid
 
 

@@ -6,12 +6,11 @@ import pytest
 import torch
 
 from sparsestreet.host_copy import HostCopy
-from sparsestreet.training import quarantine
+from sparsestreet.training import nonfinite
 from sparsestreet.training.adam import RefusedRows, RowAdam
 from sparsestreet.training.callbacks import Checkpoints
-from sparsestreet.training.finite import NotFiniteError
+from sparsestreet.training.nonfinite import FEW, SHARE, NotFiniteError, Quarantine
 from sparsestreet.training.optimizer import OptimizerSettings
-from sparsestreet.training.quarantine import FEW, SHARE, Quarantine
 from tests.training.stubs import background, fit, frame_at, make_system, rigid
 
 MEANS = "nodes.background.rows.means"
@@ -113,7 +112,7 @@ class Late(torch.Tensor):
 
 
 def test_on_a_device_counts_are_read_one_step_later(monkeypatch):
-    monkeypatch.setattr(quarantine, "copy_to_host", lambda values: HostCopy(values.as_subclass(torch.Tensor), None))
+    monkeypatch.setattr(nonfinite, "copy_to_host", lambda values: HostCopy(values.as_subclass(torch.Tensor), None))
     watched, parameter = Quarantine(), torch.zeros(50, 3)
 
     def late(count: int, step: int) -> None:

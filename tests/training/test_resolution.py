@@ -6,8 +6,7 @@ import torch
 from PIL import Image
 
 from sparsestreet.scene.rendering import render
-from sparsestreet.training.resolution import ResolutionSchedule, smaller
-from sparsestreet.training.schedule import Course
+from sparsestreet.training.schedule import Course, ResolutionSchedule, smaller
 from tests.training.stubs import StubTrainer, background, frame_at, make_system
 
 

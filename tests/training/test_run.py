@@ -33,11 +33,10 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import load_scene
-from sparsestreet.training import costs, run
-from sparsestreet.training import identity as identity_module
+from sparsestreet.training import forecast, run
+from sparsestreet.training import recipe as identity_module
 from sparsestreet.training.callbacks import Clock, DensityControl, GracefulStop, RowLedger, TrainingProgress
-from sparsestreet.training.identity import RunIdentity
-from sparsestreet.training.recipe import Recipe
+from sparsestreet.training.recipe import Recipe, RunIdentity
 from sparsestreet.training.run import CPU_TRAINER, fit, train
 from sparsestreet.training.schedule import Interval
 from tests.evaluation.frames import make_summary
@@ -334,11 +333,11 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
 
 def test_costs_are_those_of_the_stages_and_the_device(tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr(costs, "peak_megabytes", lambda device: asked.append(device) or (800.0, 6000.0))
+    monkeypatch.setattr(forecast, "peak_megabytes", lambda device: asked.append(device) or (800.0, 6000.0))
     stages, spent = StageRecorder(), {"train": 5.0, "prune/Rule at step 7": 1.5, "other": 0.25}
     monkeypatch.setattr(stages, "seconds", lambda: spent)
     STEP_PHASES.write(tmp_path, [StepPhase(3, "splat", 2.5)])
-    costs.record_costs(tmp_path, stages, torch.device("cpu", 0))
+    forecast.record_costs(tmp_path, stages, torch.device("cpu", 0))
     found = COSTS.read(tmp_path)
     assert (found.wall_seconds, found.phases) == (6.75, {"train": 5.0, "prune": 1.5, "other": 0.25})
     assert (found.passes, found.step_ms) == ({"Rule at step 7": 1.5}, {"splat": 2.5})

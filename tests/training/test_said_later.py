@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from sparsestreet.host_copy import HostCopy, copy_to_host
-from sparsestreet.training import said_later
-from sparsestreet.training.said_later import SaidLater
+from sparsestreet.training import nonfinite
+from sparsestreet.training.nonfinite import SaidLater
 from tests.training.stubs import StubTrainer, background, make_system
 
 
@@ -59,7 +59,7 @@ def test_what_is_on_its_way_is_not_the_newest(trainer: StubTrainer, monkeypatch:
     said.say(trainer, value(0.5), {})
     trainer.global_step += 1
     said.pass_on(trainer)
-    monkeypatch.setattr(said_later, "copy_to_host", lambda values: Late(values, None))
+    monkeypatch.setattr(nonfinite, "copy_to_host", lambda values: Late(values, None))
     said.say(trainer, value(0.25), {})
     assert (said.is_there, said.newest) == (False, {"loss": 0.5})
 

@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from sparsestreet.pruning import LeaveOneOutRule, RenderContext
-from sparsestreet.pruning.rule import contributions
-from sparsestreet.scene.centers import project_centers
+from sparsestreet.pruning.select import contributions
 from sparsestreet.scene.effects import LensSettings
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import RenderOptions, render
+from sparsestreet.scene.rendering import RenderOptions, project_centers, render
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.training.losses import DynamicRegion
 from sparsestreet.types import Frame

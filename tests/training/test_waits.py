@@ -31,7 +31,7 @@ from sparsestreet.scene.effects import (
     Sky,
     SkySettings,
 )
-from sparsestreet.scene.effects.recorded_poses import RecordedPoses
+from sparsestreet.scene.effects.poses import RecordedPoses
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import (
     MaskSettings,
@@ -107,12 +107,12 @@ CASES: Mapping[str, tuple[Callable[[], StreetSystem], list[str]]] = {
     # The network is most of the step, and rows that are not near would cost more than a look at their number.
     "field with reach": (
         lambda: make_system({"field": field(deform_from=0.0)}),
-        ["scene/nodes/field.py:_near: nonzero", SPLAT],
+        ["scene/nodes/deformable.py:_near: nonzero", SPLAT],
     ),
     # The camera is read on the host, and follows from what the optimizer wrote last.
     "camera poses": (
         lambda: seen_through(poses=poses()),
-        ["scene/effects/camera_poses.py:corrections: copy to the host", SPLAT],
+        ["scene/effects/poses.py:corrections: copy to the host", SPLAT],
     ),
     # Objects are rendered once more, alone.
     "all losses": (lambda: make_system(masked(), ALL_LOSSES), [SPLAT, SPLAT]),

@@ -24,7 +24,7 @@ import sparsestreet
 from sparsestreet.host_copy import HostCopy
 from sparsestreet.ops import backend, triton
 from sparsestreet.ops.triton import launch, rasterizer, screen
-from sparsestreet.training import finite, quarantine, said_later
+from sparsestreet.training import nonfinite
 
 META = torch.device("meta")
 PACKAGE = Path(sparsestreet.__file__).parent
@@ -200,6 +200,6 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
         patch.setattr(screen, "wait_for", counted)
-        for module in (finite, quarantine, said_later, screen):
+        for module in (nonfinite, nonfinite, nonfinite, screen):
             patch.setattr(module, "copy_to_host", queued)
         yield found

@@ -184,9 +184,9 @@ def _stored(run: Path) -> "tuple[StoredScene, View]":
 def scene_and_views(run: Path) -> "tuple[StoredScene, tuple[View, ...]]":
     """Return the scene and all recorded views of a run's folder."""
     from sparsestreet.scene.storage import load_scene
-    from sparsestreet.scene.views import FILE_NAME, read_views
+    from sparsestreet.scene.views import VIEWS_FILE, read_views
 
-    return load_scene(run), read_views(run / FILE_NAME).all
+    return load_scene(run), read_views(run / VIEWS_FILE).all
 
 
 def record_file(folder: Path, name: str, command: str) -> "RecordFile":

@@ -15,7 +15,7 @@ from sparsestreet.cli.config.compose import quoted
 from sparsestreet.records.summary import SUMMARY, RunSummary
 from sparsestreet.report.run_comparison import compare_runs
 from sparsestreet.report.tables import BUSY, busy_note, frames_steady, training_steady
-from sparsestreet.scene.centers import node_legend
+from sparsestreet.scene.rendering import node_legend
 
 USAGE = """\
 sparsestreet demo [out=DIR] [key=value ...]

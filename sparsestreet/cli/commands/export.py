@@ -187,11 +187,11 @@ def _lost_of_scene(stored: "StoredScene") -> list[str]:
 def _export_artifact(request: ExportRequest) -> None:
     from sparsestreet.cli.commands.scenes import open_scene
     from sparsestreet.records.run import RUN
-    from sparsestreet.scene.beside import views_of
+    from sparsestreet.scene.storage import views_of
 
     try:
         from sparsestreet.serving.artifact import DEFAULT_CAR, Provenance, write_artifact
-        from sparsestreet.serving.scenes import RigOptions, named_runs, open_run
+        from sparsestreet.serving.renderer import RigOptions, named_runs, open_run
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"a .usdz needs {error.name}: pip install 'sparsestreet[serve]'") from error
     run, options = request.scene, RigOptions(request.mount, request.names)
@@ -205,7 +205,7 @@ def _export_artifact(request: ExportRequest) -> None:
 
 
 def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
-    from sparsestreet.scene.beside import files_beside
+    from sparsestreet.scene.storage import files_beside
     from sparsestreet.scene.street_file import save_street
 
     save_street(request.out, stored, files_beside(request.scene, request.views))

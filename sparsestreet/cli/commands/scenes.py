@@ -10,13 +10,12 @@ import torch
 from sparsestreet.cli.config.targets import open_run_config
 from sparsestreet.cli.config.validate import device_of
 from sparsestreet.naming import one_line
-from sparsestreet.scene.beside import views_of
 from sparsestreet.scene.edits import Edits, edited, read_edits
 from sparsestreet.scene.edits.edits import off_the_ground
 from sparsestreet.scene.edits.file import Open
 from sparsestreet.scene.edits.nodes import ALWAYS
 from sparsestreet.scene.edits.paths import Driven, Held, Moved
-from sparsestreet.scene.storage import StoredScene, load_scene
+from sparsestreet.scene.storage import StoredScene, load_scene, views_of
 from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, read_views, seconds_of
 
 

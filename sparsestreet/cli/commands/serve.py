@@ -66,7 +66,7 @@ def serve(arguments: list[str]) -> int:
 def _serve(request: ServeRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.commands.scenes import open_scene
-    from sparsestreet.serving.scenes import RigOptions, Scenes, named_runs
+    from sparsestreet.serving.renderer import RigOptions, Scenes, named_runs
 
     try:
         from sparsestreet.serving.server import start

@@ -26,8 +26,7 @@ from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.callbacks import PhaseTimes
-from sparsestreet.training.identity import RunIdentity
-from sparsestreet.training.recipe import Recipe
+from sparsestreet.training.recipe import Recipe, RunIdentity
 from sparsestreet.training.run import build, fit, train
 from sparsestreet.training.system import StreetSystem
 

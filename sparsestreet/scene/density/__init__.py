@@ -6,8 +6,7 @@
 
 from sparsestreet.scene.density.gradient import GradientDensity, outside_boxes
 from sparsestreet.scene.density.mcmc import McmcDensity
-from sparsestreet.scene.density.statistics import DensityStatistics
-from sparsestreet.scene.density.strategy import DensityStrategy
+from sparsestreet.scene.density.strategy import DensityStatistics, DensityStrategy
 from sparsestreet.scene.density.vibrating import VibratingDensity
 
 __all__ = [

@@ -14,8 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry.quaternions import to_matrix
-from sparsestreet.scene.density.statistics import DensityStatistics
-from sparsestreet.scene.density.strategy import DensityStrategy
+from sparsestreet.scene.density.strategy import DensityStatistics, DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan, Rows
 
 

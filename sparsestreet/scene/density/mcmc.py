@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sparsestreet.geometry.quaternions import to_matrix
 from sparsestreet.scene.density.gradient import GradientDensity
-from sparsestreet.scene.density.statistics import DensityStatistics
+from sparsestreet.scene.density.strategy import DensityStatistics
 from sparsestreet.scene.gaussians import RowPlan, Rows
 
 

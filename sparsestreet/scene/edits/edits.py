@@ -10,8 +10,7 @@ from sparsestreet.scene.edits.nodes import ALWAYS, AddedObject, Change, EditedNo
 from sparsestreet.scene.edits.paths import AsRecorded, Driven, Frame, Held, Moved, Recorded
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes.node import Node
-from sparsestreet.scene.nodes.rigid import Rigid
-from sparsestreet.scene.nodes.tracked import Tracked
+from sparsestreet.scene.nodes.tracked import Rigid, Tracked
 
 Object = tuple[str, Tracked, int]
 """Name of a node, the node, and the number of one of its objects."""

@@ -5,18 +5,30 @@ splats, the affine map one of their colors, the exposure a gain for each image; 
 brings, and what takes them away from it.
 """
 
-from sparsestreet.scene.effects.affine import Affine, AffineSettings
-from sparsestreet.scene.effects.box_poses import BoxPosesSettings
-from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
 from sparsestreet.scene.effects.dirt import DirtSettings
-from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Exposed, Finding, Moment
-from sparsestreet.scene.effects.exposure import Exposure, ExposureSettings
+from sparsestreet.scene.effects.effect import (
+    Cost,
+    Effect,
+    EffectPlan,
+    EffectSettings,
+    Exposed,
+    Finding,
+    LinearizedEffects,
+    Moment,
+    linearized,
+    plan_effects,
+)
+from sparsestreet.scene.effects.exposure import Affine, AffineSettings, Exposure, ExposureSettings
 from sparsestreet.scene.effects.hood import HoodSettings
-from sparsestreet.scene.effects.lens import Lens, LensSettings
-from sparsestreet.scene.effects.linearized import LinearizedEffects, linearized
-from sparsestreet.scene.effects.motion_blur import MotionBlur, MotionBlurSettings
-from sparsestreet.scene.effects.plan import EffectPlan, plan_effects
-from sparsestreet.scene.effects.shutter import RollingShutter, ShutterSettings
+from sparsestreet.scene.effects.optics import (
+    Lens,
+    LensSettings,
+    MotionBlur,
+    MotionBlurSettings,
+    RollingShutter,
+    ShutterSettings,
+)
+from sparsestreet.scene.effects.poses import BoxPosesSettings, CameraPoses, CameraPosesSettings
 from sparsestreet.scene.effects.sky import Sky, SkySettings
 
 __all__ = [

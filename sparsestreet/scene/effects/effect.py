@@ -14,11 +14,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sparsestreet.pictures.images import Panel
+from sparsestreet.records.run import EffectDecision
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, rates_of
 from sparsestreet.scene.nodes.node import Node
-from sparsestreet.scene.options import RenderOptions
-from sparsestreet.scene.state import SceneState
+from sparsestreet.scene.state import RenderOptions, SceneState
 from sparsestreet.types import Camera, Gaussians, Rendering, View
 
 
@@ -200,3 +200,105 @@ class Effect(nn.Module, ABC):
     def is_on(self) -> bool:
         """False for what stands in the place of an effect that is left out."""
         return self.settings.when != "off"
+
+
+@dataclass(frozen=True)
+class LinearizedEffects:
+    """A small change of the image: ``slope`` (d rgb - ``background`` d alpha), with rgb and alpha of the splats."""
+
+    slope: Float[Tensor, "h w"] | None
+    """None: 1."""
+    background: Float[Tensor, "h w 3"] | None
+    """None: black."""
+
+
+def linearized(effects: Iterable[Effect], view: View) -> LinearizedEffects:
+    """All effects of a scene in their order, for a view as its splats see it.
+
+    With slopes s_k and backgrounds b_k, x_k = s_k x_(k-1) + (1 - alpha) b_k: together the product of all s_k, and the
+    sum of b_k / (s_1 ... s_k).
+    """
+    slope = background = None
+    for effect in effects:
+        own, behind = effect.slope(view), effect.background(view)
+        if own is not None:
+            slope = own if slope is None else slope * own
+        if behind is not None:
+            light = behind if slope is None else behind / slope[..., None]
+            background = light if background is None else background + light
+    return LinearizedEffects(slope, background)
+
+
+@dataclass(frozen=True)
+class PlannedEffect:
+    """One effect, what was found out about it, and what follows."""
+
+    name: str
+    settings: EffectSettings
+    finding: Finding
+    on: bool
+
+    @property
+    def only_found(self) -> bool:
+        """Whether the log calls for it, and something is missing for a scene to have it."""
+        return self.finding.called_for and not self.on
+
+    def _reason(self) -> str:
+        if not self.only_found:
+            return self.finding.reason
+        switched = f" (effects.{self.name}=auto simulates it)" if self.settings.when == "off" else ""
+        return f"found, not simulated{switched}: {self.finding.reason}"
+
+    def decision(self, data: TrainingData, rows: int) -> EffectDecision:
+        """The effect as records have it, for a scene of ``rows`` Gaussians."""
+        finding, cost = self.finding, self.settings.cost(data)
+        return EffectDecision(
+            name=self.name,
+            on=self.on,
+            source="forced" if self.settings.when != "auto" else "declared" if finding.declared else "measured",
+            reason=self._reason(),
+            value=finding.value,
+            unit=finding.unit,
+            threshold=finding.threshold,
+            noise=finding.noise,
+            numbers=cost.numbers,
+            ms=cost.ms(_pixels(data), rows),
+            gain=finding.gain,
+        )
+
+
+@dataclass(frozen=True)
+class EffectPlan:
+    """All effects that a configuration knows, in the order in which they act on an image."""
+
+    effects: tuple[PlannedEffect, ...]
+
+    def decisions(self, data: TrainingData, rows: int) -> tuple[EffectDecision, ...]:
+        """What ``run.json`` holds, for a scene of ``rows`` Gaussians."""
+        return tuple(effect.decision(data, rows) for effect in self.effects)
+
+
+def plan_effects(effects: Mapping[str, EffectSettings], data: TrainingData) -> EffectPlan:
+    """Ask every effect whether the log calls for it. Trains nothing, builds nothing, and takes seconds.
+
+    Raises ValueError, saying what is missing, for an effect that is forced on and that the log cannot support.
+    """
+    return EffectPlan(tuple(_planned(name, settings, data) for name, settings in effects.items()))
+
+
+_OFF = Finding(called_for=False, reason="the configuration says so")
+"""What is off is not looked for, unless it is off by default."""
+
+
+def _planned(name: str, settings: EffectSettings, data: TrainingData) -> PlannedEffect:
+    when = settings.when
+    finding = _OFF if when == "off" and not settings.found_when_off else settings.detect(data)
+    if when == "on" and finding.missing is not None:
+        raise ValueError(f"effects.{name} is on, but {finding.reason}: {finding.missing}, or say auto")
+    on = when == "on" or (when == "auto" and finding.called_for and not finding.missing)
+    return PlannedEffect(name, settings, finding, on)
+
+
+def _pixels(data: TrainingData) -> int:
+    """Of the largest image that is trained on."""
+    return max(view.camera.width * view.camera.height for view in data.views)

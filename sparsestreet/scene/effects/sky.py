@@ -17,7 +17,7 @@ from sparsestreet.pictures.images import Marked
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
-from sparsestreet.scene.options import RenderOptions
+from sparsestreet.scene.state import RenderOptions
 from sparsestreet.types import Rendering, View
 
 _NS_PER_PIXEL = 4.8

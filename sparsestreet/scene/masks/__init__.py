@@ -5,8 +5,7 @@ Gaussian and draws from it in every step. ``temporal`` has a network that gives 
 ``baked`` is its result, a bit per Gaussian and training frame.
 """
 
-from sparsestreet.scene.masks.baked import BakedMask, BakedMaskSettings
-from sparsestreet.scene.masks.mask import Mask, MaskScope, MaskSettings
+from sparsestreet.scene.masks.mask import BakedMask, BakedMaskSettings, Mask, MaskScope, MaskSettings
 from sparsestreet.scene.masks.sampled import SampledMask, SampledMaskSettings
 from sparsestreet.scene.masks.static import StaticMask, StaticMaskSettings, straight_through
 from sparsestreet.scene.masks.temporal import TemporalMask, TemporalMaskSettings

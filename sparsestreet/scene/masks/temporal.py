@@ -8,8 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
-from sparsestreet.scene.masks.baked import BITS, BakedMask, packed
-from sparsestreet.scene.masks.mask import Mask, MaskScope
+from sparsestreet.scene.masks.mask import BITS, BakedMask, Mask, MaskScope, packed
 from sparsestreet.scene.masks.static import straight_through
 
 FEATURES = "mask_features"

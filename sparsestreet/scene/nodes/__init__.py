@@ -7,13 +7,10 @@ moves people by their skeletons.
 """
 
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
-from sparsestreet.scene.nodes.deformable import Deformable, DeformableSettings
-from sparsestreet.scene.nodes.field import Field, FieldSettings
-from sparsestreet.scene.nodes.network import NetworkSettings
+from sparsestreet.scene.nodes.deformable import Deformable, DeformableSettings, Field, FieldSettings, NetworkSettings
 from sparsestreet.scene.nodes.node import Instances, Node, NodeSettings
-from sparsestreet.scene.nodes.rigid import Rigid, RigidSettings
 from sparsestreet.scene.nodes.smpl import Smpl, SmplSettings
-from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings
+from sparsestreet.scene.nodes.tracked import Rigid, RigidSettings, Tracked, TrackedSettings
 from sparsestreet.scene.nodes.vibrating import Vibrating, VibratingSettings
 
 __all__ = [

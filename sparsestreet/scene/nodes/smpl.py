@@ -16,16 +16,12 @@ from sparsestreet.geometry.boxes import view_lag, without_frames
 from sparsestreet.geometry.skeleton import NUM_JOINTS, Bones, posed_bones, skin
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
 from sparsestreet.ops.raw import Poses, RawGaussians
-from sparsestreet.scene.body import Body, BodyTemplate, BuiltinBody, surface
-from sparsestreet.scene.body.anatomy import Anatomy
-from sparsestreet.scene.body.people import People, people_of, trained_poses
+from sparsestreet.scene.body import Anatomy, Body, BodyTemplate, BuiltinBody, People, people_of, surface, trained_poses
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.boxes import lidar_in_boxes
-from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.gaussians import Points, lidar_in_boxes
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
-from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER
-from sparsestreet.scene.nodes.regularizers import excess_volume
+from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, excess_volume
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, matrices, stored_keyframes, stored_objects
 from sparsestreet.scene.state import SceneState
 from sparsestreet.triangulation import TriangulatedPoints

@@ -13,18 +13,24 @@ from torch import Tensor, nn
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import view_lag, without_frames
 from sparsestreet.geometry.trajectories import Trajectories, smoothed
+from sparsestreet.noise import named_generator
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
+from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.generators import named_generator
-from sparsestreet.scene.initialize.boxes import box_surface_points, lidar_in_boxes
-from sparsestreet.scene.initialize.gaussians import neighbor_scales
-from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.gaussians import Points, box_surface_points, lidar_in_boxes, neighbor_scales
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, usual_track_rates
 from sparsestreet.scene.masks import Mask, MaskScope
-from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, Instances, Node, NodeSettings
-from sparsestreet.scene.nodes.regularizers import REACH, temporal_smoothness, temporal_smoothness_at
+from sparsestreet.scene.nodes.node import (
+    BYTES_PER_NUMBER,
+    REACH,
+    Instances,
+    Node,
+    NodeSettings,
+    temporal_smoothness,
+    temporal_smoothness_at,
+)
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Track, View
 
@@ -297,3 +303,33 @@ class Tracked(Node):
     def pose_bytes(self) -> int:
         """Returns the float32 bytes of the keyframes: each a time, a quaternion and a translation with corrections."""
         return BYTES_PER_NUMBER * 8 * int(self.keyframe_valid.sum())
+
+
+@dataclass(frozen=True, kw_only=True)
+class RigidSettings(TrackedSettings):
+    """``TrackedSettings`` with the distance by which a Gaussian may leave its box."""
+
+    min_displacement: float | None = 1.0
+    min_gaussians: int = 1000
+    max_gaussians: int | None = 8000
+    points_per_instance: int = 300
+    box_margin: float = 0.1
+    """Meters by which a row's center may lie outside its box; annotated boxes are about this tight."""
+
+    @property
+    def node_class(self) -> "type[Rigid]":
+        return Rigid
+
+
+class Rigid(Tracked):
+    """Objects whose Gaussians keep their places in the box."""
+
+    settings: RigidSettings
+
+    def raw_at(self, view: View, state: SceneState) -> RawGaussians:
+        """Returns every instance's Gaussians at its pose; opacity is exactly 0 if the instance is absent."""
+        return self.placed(view)
+
+    def outside(self) -> Bool[Tensor, " n"]:
+        """Returns whether each row's center left its box by more than ``box_margin``."""
+        return outside_boxes(self.rows.means, self.rows.instances, self.sizes, margin=self.settings.box_margin)

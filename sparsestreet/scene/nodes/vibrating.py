@@ -9,15 +9,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from sparsestreet.noise import named_generator
 from sparsestreet.ops.raw import RawGaussians
+from sparsestreet.scene.density.vibrating import displacements, faded_logits, mean_velocities
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings
 from sparsestreet.scene.nodes.node import Node, stored_frame_periods
 from sparsestreet.scene.state import SceneState
-from sparsestreet.scene.vibration import displacements, faded_logits, mean_velocities
 from sparsestreet.types import View
 
 

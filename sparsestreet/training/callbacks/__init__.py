@@ -6,19 +6,11 @@ through ``resizing``. ``row_ledger``, ``phase_times``, ``held_out_curve`` and ``
 ``checkpoints``, ``run_files`` and ``graceful_stop`` see to what a run leaves, also one that is interrupted.
 """
 
-from sparsestreet.training.callbacks.checkpoints import Checkpoints, newest_checkpoint, step_of
-from sparsestreet.training.callbacks.clock import Clock
 from sparsestreet.training.callbacks.density_control import DensityControl
-from sparsestreet.training.callbacks.graceful_stop import GracefulStop
-from sparsestreet.training.callbacks.held_out_curve import HeldOutCurve
-from sparsestreet.training.callbacks.mask_training import MaskTraining
-from sparsestreet.training.callbacks.pace import Pace
-from sparsestreet.training.callbacks.phase_times import PhaseTimes
-from sparsestreet.training.callbacks.progress import TrainingProgress
-from sparsestreet.training.callbacks.pruning import Pruning
-from sparsestreet.training.callbacks.row_ledger import RowLedger
-from sparsestreet.training.callbacks.run_files import RunFiles
-from sparsestreet.training.callbacks.stage_times import StageTimes
+from sparsestreet.training.callbacks.files import Checkpoints, GracefulStop, RunFiles, newest_checkpoint, step_of
+from sparsestreet.training.callbacks.progress import Pace, TrainingProgress
+from sparsestreet.training.callbacks.sparsify import MaskTraining, Pruning
+from sparsestreet.training.callbacks.times import Clock, HeldOutCurve, PhaseTimes, RowLedger, StageTimes
 
 __all__ = [
     "Checkpoints",

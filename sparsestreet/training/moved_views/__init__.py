@@ -13,8 +13,7 @@ many of its pixels show. Fused lidar as a target beside the path follows LiDAR-E
     build       from a log to its terms
 """
 
-from sparsestreet.training.moved_views.build import moved_view_term
-from sparsestreet.training.moved_views.settings import MovedViews
-from sparsestreet.training.moved_views.term import MovedViewTerm
+from sparsestreet.training.moved_views.returns import MovedViews
+from sparsestreet.training.moved_views.term import MovedViewTerm, moved_view_term
 
 __all__ = ["MovedViewTerm", "MovedViews", "moved_view_term"]

@@ -7,19 +7,237 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import torch
+from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from sparsestreet.data.lazy import Frames, Sweeps
+from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.geometry.boxes import CarriedPoints, box_at, inside_box
-from sparsestreet.scene.generators import named_generator
-from sparsestreet.scene.initialize.boxes import outside_boxes, returns_in_box_frame
-from sparsestreet.scene.initialize.points import at_most
-from sparsestreet.training.moved_views.coloring import agreement, seen_colors
-from sparsestreet.training.moved_views.settings import MovedViews
-from sparsestreet.training.moved_views.target import Box, Returns
-from sparsestreet.types import Frame, Sweep, Track
+from sparsestreet.geometry.cameras import inverse, project, transform_points
+from sparsestreet.noise import named_generator
+from sparsestreet.scene.initialize.gaussians import at_most, outside_boxes, returns_in_box_frame
+from sparsestreet.types import Camera, Frame, Sweep, Track
 
-ENLARGEMENT = 1.15
+
+@dataclass(frozen=True, kw_only=True)
+class MovedViews:
+    """Settings of the terms of moved views. Raises ValueError for impossible ones.
+
+    Both terms are sums over the pixels whose content is known, divided by all pixels of the view: the less the lidar
+    sees, the less they weigh.
+    """
+
+    every: int = 4
+    """Steps from one moved view to the next."""
+    start: float = 0.1
+    stop: float = 0.9
+    """Fractions of the run between which views are moved. The rest before the end belongs to the recorded views."""
+    sideways: float = 4.0
+    """Meters; a camera moves by a uniformly drawn distance up to this to the left or right, but into no wall."""
+    divisor: int = 2
+    """Sides of a moved view are those of the recorded one divided by this."""
+    depth_weight: float = 4.0
+    """Of the absolute error of the inverse depth, 1/m."""
+    color_weight: float = 4.0
+    """Of the absolute error of the color, mean over its channels."""
+    sweeps: int = 10
+    """How many frames before and after its own a view sees returns of."""
+    returns_per_sweep: int = 30_000
+    """A sweep keeps at most this number of returns, drawn at random: memory."""
+    returns_per_view: int = 30_000
+    """A view looks at no more returns, drawn at random in each step: time."""
+    tolerance: float = 0.1
+    """Difference between the color of a return and an image of another instant at which the return weighs 1/e."""
+
+    def __post_init__(self) -> None:
+        counts = {name: getattr(self, name) for name in ("every", "divisor", "returns_per_sweep", "returns_per_view")}
+        if wrong := {name: value for name, value in counts.items() if value < 1}:
+            raise ValueError(f"moved views count from 1, got {wrong}: moved_views=none leaves them out")
+        positive = {name: getattr(self, name) for name in ("sideways", "tolerance")}
+        if wrong := {name: value for name, value in positive.items() if not value > 0}:
+            raise ValueError(
+                f"moved views need lengths and tolerances above 0, got {wrong}: moved_views=none leaves them out"
+            )
+        least = {name: getattr(self, name) for name in ("depth_weight", "color_weight", "sweeps")}
+        if wrong := {name: value for name, value in least.items() if not value >= 0}:
+            raise ValueError(f"moved views need weights and numbers of sweeps of at least 0, got {wrong}")
+        if not 0 <= self.start <= self.stop <= 1:
+            raise ValueError(f"moved views need 0 <= start <= stop <= 1, got {self.start} and {self.stop}")
+
+
+NEAREST, FARTHEST = 0.5, 80.0
+"""Meters; returns outside count nothing, as in the depth term."""
+WINDOW = 5
+"""Pixels. A return is hidden if a clearly nearer one lies in the window around it: one sees through sparse points."""
+SLACK, SLACK_METERS = 1.15, 0.3
+"""Clearly nearer: by more than this factor and distance. A road seen at a flat angle stays within."""
+ENLARGEMENT = 1.1
+"""Of the boxes behind which nothing is known: they are imprecise."""
+_NO_RETURN = torch.iinfo(torch.int64).max
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Colored lidar returns."""
+
+    points: Float[Tensor, "n 3"]
+    """World, or the frame of a box, meters."""
+    colors: Float[Tensor, "n 3"]
+    """RGB in [0, 1]."""
+    weights: Float[Tensor, " n"]
+    """How far they are trusted, in [0, 1]."""
+
+    def __len__(self) -> int:
+        return self.points.shape[0]
+
+    def at(self, rows: Int[Tensor, " k"]) -> "Returns":
+        return Returns(self.points[rows], self.colors[rows], self.weights[rows])
+
+    @staticmethod
+    def concatenate(parts: "Sequence[Returns]") -> "Returns":
+        """The rows of all parts in order."""
+        if not parts:
+            return Returns(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+        return Returns(
+            torch.cat([part.points for part in parts]),
+            torch.cat([part.colors for part in parts]),
+            torch.cat([part.weights for part in parts]),
+        )
+
+
+@dataclass(frozen=True)
+class Target:
+    """What is known of an image. Where the weight is 0, the other numbers mean nothing."""
+
+    depth: Float[Tensor, "h w"]
+    """Along the optical axis, meters."""
+    color: Float[Tensor, "h w 3"]
+    weight: Float[Tensor, "h w"]
+
+
+Box = tuple[Float64[Tensor, "4 4"], Float[Tensor, "3"]]
+"""world_from_box, and the lengths of its sides in meters."""
+
+
+def target(camera: Camera, street: Returns, objects: Returns, boxes: Sequence[Box], reach: float = 0.5) -> Target:
+    """Each pixel takes the nearest of the returns that fall into its middle and that nothing hides.
+
+    Args:
+        camera: that looks.
+        street: what stands still; where one of the boxes is in the way nothing is known of it.
+        objects: what lies in some of the boxes.
+        boxes: of all moving objects at this instant.
+        reach: pixels from a pixel's center, along both axes, within which a return counts. 0.5 is the whole pixel; a
+            smaller part compares a point with what is rendered at that very point.
+    """
+    returns = Returns.concatenate([street, objects])
+    if not len(returns):
+        shape = (camera.height, camera.width)
+        return Target(torch.ones(shape), torch.zeros(*shape, 3), torch.zeros(shape))
+    rows, positions, depths = unhidden(camera, returns.points)
+    counts = ((positions % 1 - 0.5).abs() <= reach).all(1) & (depths > NEAREST) & (depths < FARTHEST)
+    rows, positions, depths = rows[counts], positions[counts], depths[counts]
+    counts = (rows >= len(street)) | ~behind_boxes(camera, returns.points[rows], boxes)
+    rows, positions, depths = rows[counts], positions[counts], depths[counts]
+    # Bits of positive floats are in their order; of equally near returns the first counts, on every device.
+    keys = (depths.view(torch.int32).long() << 32) | rows
+    size = camera.height * camera.width
+    first = torch.full((size,), _NO_RETURN, device=keys.device).scatter_reduce(
+        0, _pixels(camera, positions), keys, "amin"
+    )
+    found = (first != _NO_RETURN).view(camera.height, camera.width)
+    row = torch.where(found.flatten(), first & 0xFFFFFFFF, 0)
+    return Target(
+        torch.where(found, (first >> 32).to(torch.int32).view(torch.float32).view(found.shape), 1.0),
+        returns.colors[row].view(*found.shape, 3),
+        torch.where(found, returns.weights[row].view(found.shape), 0.0),
+    )
+
+
+def unhidden(
+    camera: Camera, points: Float[Tensor, "n 3"], window: int = WINDOW
+) -> tuple[Int[Tensor, " v"], Float[Tensor, "v 2"], Float[Tensor, " v"]]:
+    """Rows, image positions (pixels) and depths (meters) of the points in the image that none of the others hides."""
+    positions, depths, inside = project(camera, points)
+    rows = torch.nonzero(inside).squeeze(-1)
+    positions, depths = positions[rows], depths[rows]
+    pixels = _pixels(camera, positions)
+    nearest = torch.full((camera.height * camera.width,), 1e6, device=points.device)
+    image = nearest.scatter_reduce(0, pixels, depths, "amin").view(1, camera.height, camera.width)
+    around = -max_pool2d(-image, window, stride=1, padding=window // 2).flatten()[pixels]
+    seen = depths <= SLACK * around + SLACK_METERS
+    return rows[seen], positions[seen], depths[seen]
+
+
+def behind_boxes(camera: Camera, points: Float[Tensor, "n 3"], boxes: Sequence[Box]) -> Bool[Tensor, " n"]:
+    """Whether the line from the camera to a point meets one of the boxes, by the slabs of Kay and Kajiya (1986).
+
+    >>> camera = Camera(torch.eye(4), torch.eye(3), width=4, height=4)
+    >>> box = torch.eye(4, dtype=torch.float64)
+    >>> box[2, 3] = 5.0
+    >>> points = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 9.0], [9.0, 0.0, 9.0]])
+    >>> behind_boxes(camera, points, [(box, torch.tensor([2.0, 2.0, 2.0]))]).tolist()
+    [False, True, False]
+    """
+    hidden = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    for world_from_box, size in boxes:
+        box_from_world = inverse(world_from_box).to(points)
+        eye = transform_points(box_from_world, camera.position[None].to(points))
+        steps = transform_points(box_from_world, points) - eye
+        steps = torch.where(steps.abs() < 1e-6, 1e-6, steps)
+        half = 0.5 * ENLARGEMENT * size.to(points)
+        sides = ((-half - eye) / steps, (half - eye) / steps)
+        enters, leaves = torch.minimum(*sides).amax(1), torch.maximum(*sides).amin(1)
+        hidden |= (enters < leaves) & (leaves > 0) & (enters < 1)
+    return hidden
+
+
+def _pixels(camera: Camera, positions: Float[Tensor, "n 2"]) -> Int[Tensor, " n"]:
+    column, line = positions.long().unbind(-1)
+    return line * camera.width + column
+
+
+def seen_colors(
+    points: Float[Tensor, "n 3"], frames: Sequence[Frame], places: Sequence[Float[Tensor, "n 3"]] | None = None
+) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
+    """RGB of each point in the first image that shows it, and which points one shows.
+
+    ``places``: where the points are in each of the images; None: in all of them where they were measured. Unlike
+    ``data.lidar.color_points`` a point behind nearer ones has no color: the lidar stands higher than the cameras and
+    looks over cars, whose color such a point would take.
+    """
+    colors, seen = torch.zeros_like(points), torch.zeros(len(points), dtype=torch.bool)
+    for frame, place in zip(frames, places or [points] * len(frames), strict=True):
+        rows, positions, _ = unhidden(frame.camera, place)
+        column, line = positions.long().unbind(-1)
+        if frame.ego is not None:  # the recording car hides what lies behind it
+            shown = ~frame.ego[line, column]
+            rows, column, line = rows[shown], column[shown], line[shown]
+        new = ~seen[rows]
+        colors[rows[new]] = frame.image[line[new], column[new]].float() / 255
+        seen[rows] = True
+    return colors, seen
+
+
+def agreement(
+    points: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], others: Sequence[Frame], tolerance: float
+) -> Float[Tensor, " n"]:
+    """exp(-d / tolerance), d the least difference (mean over channels) to images of other instants; 1 where none shows
+    the point.
+
+    A point that stands still has its color in some other image too. One on an object that moves without a box, at an
+    edge that lidar and camera see at different places, or on a mirror has not.
+    """
+    least = torch.full((len(points),), torch.inf)
+    for frame in others:
+        rows, pixels, _ = visible_pixels(frame.camera, points, frame.ego)
+        difference = (frame.image.reshape(-1, 3)[pixels].float() / 255 - colors[rows]).abs().mean(1)
+        least[rows] = torch.minimum(least[rows], difference)
+    return torch.where(least.isinf(), 1.0, torch.exp(-least / tolerance))
+
+
+POINT_ENLARGEMENT = 1.15
 """Of moving boxes, in which nothing belongs to the street."""
 ROAD = 0.25
 """Meters above the floor of its box from which on a return belongs to the object and not to the road below it."""
@@ -91,10 +309,10 @@ def collect(
     generator = named_generator(seed, "moved views")
     street, starts, objects, carried = [], [0], {}, {}
     for sweep in sweeps:
-        points = CarriedPoints(sweep.points, sweep.time, sweep.index, moving, ENLARGEMENT)
+        points = CarriedPoints(sweep.points, sweep.time, sweep.index, moving, POINT_ENLARGEMENT)
         shown = images(sweep.index)
         colors, seen = seen_colors(sweep.points, shown, [points.at(frame.time) for frame in shown])
-        still = seen & outside_boxes(moving, sweep, ENLARGEMENT)
+        still = seen & outside_boxes(moving, sweep, POINT_ENLARGEMENT)
         rows = at_most(settings.returns_per_sweep, torch.nonzero(still).squeeze(-1), generator)
         others = [frame for near in _beside(sweep.index, instants) for frame in images(near)]
         weights = agreement(sweep.points[rows], colors[rows], others, settings.tolerance)

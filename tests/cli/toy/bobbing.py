@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.gaussians import neighbor_scales
-from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.gaussians import Points, neighbor_scales
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes import Instances, Node, NodeSettings

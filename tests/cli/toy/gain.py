@@ -10,8 +10,7 @@ from torch import Tensor, nn
 
 from sparsestreet.scene.effects import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
-from sparsestreet.scene.options import RenderOptions
-from sparsestreet.scene.state import SceneState
+from sparsestreet.scene.state import RenderOptions, SceneState
 from sparsestreet.types import Rendering, View
 
 

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 
 import torch
 
-from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.scene.initialize.points import Points
+from sparsestreet.scene.initialize.gaussians import Points
 from sparsestreet.scene.initialize.sources import PointSource, Seeds
-from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.initialize.training_data import Coverage, TrainingData
 
 
 @dataclass(frozen=True, kw_only=True)

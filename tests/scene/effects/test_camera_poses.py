@@ -14,9 +14,9 @@ from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import inverse, moved
 from sparsestreet.geometry.trajectories import Trajectories, smoothed
 from sparsestreet.ops import SplatSettings, splat
-from sparsestreet.scene.effects import Finding, camera_poses
-from sparsestreet.scene.effects.camera_poses import CameraPoses, CameraPosesSettings
-from sparsestreet.scene.effects.recorded_poses import RecordedPoses
+from sparsestreet.scene.effects import Finding
+from sparsestreet.scene.effects import poses as camera_poses
+from sparsestreet.scene.effects.poses import CameraPoses, CameraPosesSettings, RecordedPoses
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import FINISHED

@@ -21,7 +21,7 @@ from sparsestreet.scene.effects import (
     SkySettings,
     plan_effects,
 )
-from sparsestreet.scene.effects.lens import Pinhole
+from sparsestreet.scene.effects.optics import Pinhole
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.state import FINISHED, SceneState

@@ -10,12 +10,10 @@ from sparsestreet.data.lazy import as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.scene.effects import MotionBlur, MotionBlurSettings, plan_effects
-from sparsestreet.scene.effects.light import light_of, stored_of
-from sparsestreet.scene.effects.motion_blur import moments_of, num_moments
+from sparsestreet.scene.effects.optics import moments_of, num_moments
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.options import RenderOptions
-from sparsestreet.scene.rendering import GatheredSplats, render
-from sparsestreet.scene.state import SceneState
+from sparsestreet.scene.rendering import GatheredSplats, light_of, render, stored_of
+from sparsestreet.scene.state import RenderOptions, SceneState
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from sparsestreet.types import Shutter, View
 from tests.scene.street import (

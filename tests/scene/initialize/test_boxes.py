@@ -1,7 +1,7 @@
 import torch
 
 from sparsestreet.geometry.cameras import inverse, transform_points
-from sparsestreet.scene.initialize.boxes import box_surface_points, outside_swept_boxes
+from sparsestreet.scene.initialize.gaussians import box_surface_points, outside_swept_boxes
 from tests.scene.street import car_pose, street_log
 
 

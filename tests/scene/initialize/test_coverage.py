@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Frames, as_frames
-from sparsestreet.scene.initialize.coverage import VIEWS, Coverage, beyond_lidar, coverage
-from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.initialize.training_data import VIEWS, Coverage, TrainingData, beyond_lidar, coverage
 from sparsestreet.triangulation import StreetPoints
 from sparsestreet.types import Frame, SparsePoints, View
 from tests.scene.street import camera_at, street_log, triangulated

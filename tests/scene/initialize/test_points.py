@@ -3,9 +3,8 @@ from dataclasses import replace
 import torch
 
 from sparsestreet.geometry.cameras import project
-from sparsestreet.scene.initialize.points import Points, thinned
-from sparsestreet.scene.initialize.sources import FarPoints, NearPoints
-from sparsestreet.scene.initialize.sources.guesses import random_points, seen_points
+from sparsestreet.scene.initialize.gaussians import Points, thinned
+from sparsestreet.scene.initialize.sources import FarPoints, NearPoints, random_points, seen_points
 from tests.scene.street import frame_at
 from tests.typed import there
 

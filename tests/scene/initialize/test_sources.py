@@ -7,12 +7,17 @@ import pytest
 import torch
 
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
-from sparsestreet.scene.initialize.coverage import Coverage
-from sparsestreet.scene.initialize.planes import fit_planes
-from sparsestreet.scene.initialize.points import Points
-from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
-from sparsestreet.scene.initialize.sources.images import pixel_sizes
-from sparsestreet.scene.initialize.training_data import TrainingData
+from sparsestreet.scene.initialize.gaussians import Points, fit_planes
+from sparsestreet.scene.initialize.sources import (
+    FarPoints,
+    ImagePoints,
+    LidarPoints,
+    NearPoints,
+    PointSource,
+    Seeds,
+    pixel_sizes,
+)
+from sparsestreet.scene.initialize.training_data import Coverage, TrainingData
 from sparsestreet.triangulation import StreetPoints, TriangulatedPoints
 from sparsestreet.types import SparsePoints, Sweep, View
 from tests.scene.street import frame_at, rigid_settings, street_log, training_data, triangulated

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.scene.nodes.network import DeformationNetwork, NetworkSettings, encoded
+from sparsestreet.scene.nodes.deformable import DeformationNetwork, NetworkSettings, encoded
 
 SMALL = NetworkSettings(width=12, depth=4, skip=2, position_octaves=3, time_octaves=2)
 

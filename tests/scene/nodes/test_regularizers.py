@@ -7,7 +7,7 @@ import torch
 
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes.regularizers import sharp_shape, temporal_smoothness
+from sparsestreet.scene.nodes.node import sharp_shape, temporal_smoothness
 from sparsestreet.scene.state import SceneState
 from tests.scene.street import background, random_rows, rigid, rigid_settings, static_mask, view_at
 

@@ -3,12 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.scene.nodes.regularizers import (
-    excess_volume,
-    sharp_shape_ratio,
-    temporal_smoothness,
-    temporal_smoothness_at,
-)
+from sparsestreet.scene.nodes.node import excess_volume, sharp_shape_ratio, temporal_smoothness, temporal_smoothness_at
 from sparsestreet.scene.state import SceneState
 from tests.scene.nodes.test_regularizers import curved, tracks
 from tests.scene.people import smpl, walker

@@ -11,8 +11,7 @@ import torch
 
 from sparsestreet.ranks import LostProcessError
 from sparsestreet.training.callbacks import Checkpoints, newest_checkpoint
-from sparsestreet.training.callbacks.checkpoints import step_of
-from sparsestreet.training.callbacks.graceful_stop import TornStop
+from sparsestreet.training.callbacks.files import TornStop, step_of
 from tests.training.stubs import StubTrainer, background, make_system
 
 

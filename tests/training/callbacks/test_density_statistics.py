@@ -6,7 +6,7 @@ from torch import Tensor
 
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.rendering import SceneRendering
-from sparsestreet.training.callbacks.resizing import resize_rows
+from sparsestreet.training.callbacks.density_control import resize_rows
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.types import Rendering

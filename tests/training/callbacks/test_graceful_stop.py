@@ -9,7 +9,7 @@ import torch
 from lightning import Callback, Trainer
 
 from sparsestreet.training.callbacks import Checkpoints, GracefulStop
-from sparsestreet.training.callbacks.graceful_stop import SIGNALS, TornStop
+from sparsestreet.training.callbacks.files import SIGNALS, TornStop
 from tests.training.stubs import background, fit, frame_at, make_system
 
 STEPS = 4

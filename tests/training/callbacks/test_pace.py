@@ -11,7 +11,7 @@ from sparsestreet.evaluation.speed import Timing
 from sparsestreet.phases import StageRecorder
 from sparsestreet.pruning import OpacityRule
 from sparsestreet.records.run import RUN
-from sparsestreet.training.callbacks import Pace, Pruning, pace
+from sparsestreet.training.callbacks import Pace, Pruning, progress
 from sparsestreet.training.forecast import CLOSING_SECONDS
 from sparsestreet.training.run import train
 from sparsestreet.training.schedule import Course
@@ -52,9 +52,9 @@ class Clocked(StageRecorder):
 @pytest.fixture
 def clocked(monkeypatch):
     """Trials say a tenth of a second for a step, half a second for an image, nothing for a rendering."""
-    monkeypatch.setattr(pace, "measured_step", lambda *_: 0.1)
-    monkeypatch.setattr(pace, "measured_evaluation", lambda *_: (0.5, 0.0))
-    monkeypatch.setattr(pace, "growth_of", lambda _: 1.0)
+    monkeypatch.setattr(progress, "measured_step", lambda *_: 0.1)
+    monkeypatch.setattr(progress, "measured_evaluation", lambda *_: (0.5, 0.0))
+    monkeypatch.setattr(progress, "growth_of", lambda _: 1.0)
     return Steps()
 
 
@@ -112,7 +112,7 @@ def test_a_trial_of_a_few_steps_is_not_forecast(tmp_path, clocked, monkeypatch, 
     def measured(*_):
         raise AssertionError("nothing to forecast")
 
-    monkeypatch.setattr(pace, "measured_step", measured)
+    monkeypatch.setattr(progress, "measured_step", measured)
     still = replace(recipe(tmp_path), callbacks={})
     with caplog.at_level(logging.INFO):
         train(still, data(), tmp_path, max_steps=12, make_trainer=partial(TRAINER, fast_dev_run=1))

@@ -10,7 +10,7 @@ from sparsestreet.scene.gaussians import RowPlan, Rows, Selection
 from sparsestreet.scene.masks import Mask, StaticMaskSettings
 from sparsestreet.scene.nodes import Background
 from sparsestreet.training.callbacks import Clock
-from sparsestreet.training.callbacks.resizing import end_mask, resize_rows
+from sparsestreet.training.callbacks.density_control import end_mask, resize_rows
 from tests.training.stubs import BASE, Listener, StubTrainer, background, frame_at, labels, make_rows, make_system
 
 PLAN = RowPlan(4, torch.tensor([3, 1, 1]), torch.tensor([False, False, True]))

@@ -11,7 +11,7 @@ from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, RowLedger
-from sparsestreet.training.callbacks.resizing import resize_rows
+from sparsestreet.training.callbacks.density_control import resize_rows
 from sparsestreet.training.schedule import Interval
 from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system, rigid, set_rows
 

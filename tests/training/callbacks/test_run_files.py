@@ -16,8 +16,8 @@ from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.scene.views import read_views
 from sparsestreet.training.callbacks import Clock, RunFiles
-from sparsestreet.training.callbacks.graceful_stop import TornStop
-from sparsestreet.training.callbacks.resizing import resize_rows
+from sparsestreet.training.callbacks.density_control import resize_rows
+from sparsestreet.training.callbacks.files import TornStop
 from tests.evaluation.frames import make_run
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
 from tests.typed import there

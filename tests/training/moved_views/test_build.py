@@ -5,7 +5,7 @@ import logging
 import pytest
 
 from sparsestreet.data.lidar import EdgeShift
-from sparsestreet.training.moved_views.build import report_shift
+from sparsestreet.training.moved_views.term import report_shift
 
 
 @pytest.mark.parametrize(

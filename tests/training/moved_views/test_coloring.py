@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.training.moved_views.coloring import agreement, seen_colors
+from sparsestreet.training.moved_views.returns import agreement, seen_colors
 from sparsestreet.types import Frame
 from tests.training.moved_views.test_target import HEIGHT, WIDTH, at_pixel, camera
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.training.moved_views.target import Returns, behind_boxes, target, unhidden
+from sparsestreet.training.moved_views.returns import Returns, behind_boxes, target, unhidden
 from sparsestreet.types import Camera
 
 WIDTH, HEIGHT = 8, 6

@@ -5,16 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sparsestreet.noise import named_generator
 from sparsestreet.scene.effects import LensSettings
-from sparsestreet.scene.effects.lens import Pinhole
-from sparsestreet.scene.generators import named_generator
+from sparsestreet.scene.effects.optics import Pinhole
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, from_another_camera, render
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
 from sparsestreet.training.moved_views import term as term_module
-from sparsestreet.training.moved_views.returns import StreetReturns
-from sparsestreet.training.moved_views.target import Returns, target
+from sparsestreet.training.moved_views.returns import Returns, StreetReturns, target
 from sparsestreet.training.moved_views.term import free_range
 from sparsestreet.types import Camera, Frame, Track, View
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid

@@ -14,8 +14,7 @@ from sparsestreet.ranks import ALONE, LostProcessError, Ranks
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.training.adam import RowAdam
-from sparsestreet.training.parallel import DisagreementError, check_agreement, exchange
-from sparsestreet.training.parallel.agreement import checksum
+from sparsestreet.training.parallel import DisagreementError, check_agreement, checksum, exchange
 from tests.training.parallel.several import PATIENCE, several
 from tests.training.stubs import background, frame_at, rigid, set_rows
 

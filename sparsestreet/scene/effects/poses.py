@@ -1,12 +1,9 @@
-"""Camera poses: a learned rigid correction of the pose of each training image.
-
-Values follow the corrected camera, which everything in a frame sees. Its gradient does not come from the op: to a
-camera that moves, the world moves rigidly the other way, so the gradients of the Gaussians have it. This costs two
-small sums over the rows in the backward pass, and nothing in the forward pass.
-"""
+"""Corrections of the poses of cameras and boxes, trained with the scene."""
 
 import math
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -14,16 +11,125 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
+from sparsestreet.evidence.motion import box_jitter
 from sparsestreet.evidence.poses import pose_noise, seen_from
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import displacement, without_frames
-from sparsestreet.geometry.cameras import exact_position
+from sparsestreet.geometry.cameras import exact_position, inverse
+from sparsestreet.geometry.trajectories import Trajectories, smoothed
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
-from sparsestreet.scene.effects.recorded_poses import RecordedPoses
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
+from sparsestreet.scene.nodes.node import Node
+from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.state import SceneState
 from sparsestreet.types import Camera, Gaussians, Track, View
+
+Neighbors = tuple[int, int, float]
+"""Places of the images before and behind, and the fraction of the way between them; twice the same where one lacks."""
+
+
+class RecordedPoses:
+    """Training images by frame and camera, on the host."""
+
+    def __init__(
+        self, indices: Sequence[tuple[int, int]], times: Sequence[float], poses: Float[Tensor, "n 4 4"]
+    ) -> None:
+        """``poses`` are camera_from_world. Raises ValueError where two images are one camera's of one frame."""
+        self.indices, self.times, self.poses = tuple(indices), tuple(times), poses.cpu()
+        self.places = {index: place for place, index in enumerate(self.indices)}
+        if len(self.places) < len(self.indices):
+            raise ValueError(f"every image has a frame and a camera of its own, got {list(self.indices)}")
+        self._by_camera: dict[int, list[int]] = defaultdict(list)
+        for place in sorted(range(len(self.times)), key=self.times.__getitem__):
+            self._by_camera[self.indices[place][1]].append(place)
+        self._inner = self._with_two_neighbors()
+
+    def place(self, view: View) -> int | None:
+        """Of the image that a view belongs to; None: it was not trained on."""
+        if view.frame_index is None or view.camera_index is None:
+            return None
+        return self.places.get(view.indices)
+
+    def predicted(self, view: View, corrections: Float64[Tensor, "n 6"]) -> Float64[Tensor, "6"] | None:
+        """The correction of an image that was not trained on; None where its camera has no training image.
+
+        Errors of poses may be smooth over time, or jump from image to image. The mean of its neighbors' corrections
+        covers the first. The second show as steps of the recorded path, since cars drive smoothly: part of the image's
+        distance from the line between its neighbors is added. Least squares over the training images, of which each
+        is predicted from its neighbors, say how large that part is. The pixels of the image are not used.
+        """
+        around = self._around(view)
+        if around is None:
+            return None
+        beside = self._beside(view.camera.camera_from_world, around)
+        return _mean(corrections, around) + self._shares(corrections) * beside
+
+    def to_smooth_paths(self) -> Float64[Tensor, "n 6"]:
+        """The corrections that move each image to a smooth path of its camera (``geometry.smooth_paths``)."""
+        found = torch.zeros(len(self.indices), 6, dtype=torch.float64)
+        for places in self._by_camera.values():
+            times = torch.tensor([[self.times[place] for place in places]])
+            ends = inverse(self.poses[places].double())
+            turned = quat.from_matrix(ends[:, :3, :3]).float()[None]
+            path = Trajectories(
+                times, turned, ends[None, :, :3, 3].float(), torch.ones_like(times, dtype=torch.bool), times[:, [0, -1]]
+            )
+            rotations, shifts = (each[0].double() for each in smoothed(path))
+            undone = quat.to_matrix(quat.from_rotation_vector(-rotations))
+            ahead = ends[:, :3, :3].mT @ shifts[:, :, None]
+            found[places] = torch.cat((-(undone @ ahead)[:, :, 0], -rotations), 1)
+        return found
+
+    def _around(self, view: View) -> Neighbors | None:
+        places = self._by_camera.get(-1 if view.camera_index is None else view.camera_index)
+        if not places:
+            return None
+        behind = bisect_left([self.times[place] for place in places], view.time)
+        low, high = places[max(behind - 1, 0)], places[min(behind, len(places) - 1)]
+        step = self.times[high] - self.times[low]
+        return low, high, (view.time - self.times[low]) / step if step > 0 else 0.0
+
+    def _beside(self, camera_from_world: Float[Tensor, "4 4"], around: Neighbors) -> Float64[Tensor, "6"]:
+        """The motion from a recorded pose to that on the line between two others; 0 where there is no line."""
+        low, high, fraction = around
+        if low == high:
+            return torch.zeros(6, dtype=torch.float64)
+        ends = inverse(self.poses[[low, high]].double())
+        first, second = quat.from_matrix(ends[:, :3, :3])
+        turned = quat.slerp(first, second, torch.tensor(fraction, dtype=torch.float64))
+        line = torch.eye(4, dtype=torch.float64)
+        line[:3, :3] = quat.to_matrix(turned)
+        line[:3, 3] = torch.lerp(ends[0, :3, 3], ends[1, :3, 3], fraction)
+        motion = inverse(line) @ inverse(camera_from_world.detach().double().cpu())
+        return torch.cat((motion[:3, 3], quat.to_rotation_vector(quat.from_matrix(motion[:3, :3]))))
+
+    def _with_two_neighbors(self) -> list[tuple[int, Neighbors, Float64[Tensor, "6"]]]:
+        """Training images between two of their camera: their places, these neighbors, and how far they lie beside."""
+        found = []
+        for places in self._by_camera.values():
+            for low, place, high in zip(places, places[1:], places[2:], strict=False):
+                step = self.times[high] - self.times[low]
+                around = low, high, (self.times[place] - self.times[low]) / step if step > 0 else 0.5
+                found.append((place, around, self._beside(self.poses[place], around)))
+        return found
+
+    def _shares(self, corrections: Float64[Tensor, "n 6"]) -> Float64[Tensor, "6"]:
+        """What part of the distance from the line is error: in [0, 1], one for translations and one for rotations."""
+        if not self._inner:
+            return torch.zeros(6, dtype=torch.float64)
+        places, neighbors, beside = zip(*self._inner, strict=True)
+        missing = corrections[list(places)] - torch.stack([_mean(corrections, around) for around in neighbors])
+        distance = torch.stack(beside)
+        products, squares = (missing * distance).reshape(-1, 2, 3), distance.square().reshape(-1, 2, 3)
+        share = products.sum((0, 2)) / squares.sum((0, 2)).clamp(min=1e-20)
+        return share.clamp(0, 1).repeat_interleave(3)
+
+
+def _mean(corrections: Float64[Tensor, "n 6"], around: Neighbors) -> Float64[Tensor, "6"]:
+    low, high, fraction = around
+    return torch.lerp(corrections[low], corrections[high], min(max(fraction, 0.0), 1.0))
+
 
 _MOVES = 0.5
 """Meters that an object must get before its points do not count."""
@@ -252,3 +358,54 @@ def _torque(products: Float[Tensor, "4 4"]) -> Float[Tensor, "3"]:
     """sum vec(h q*) / 2 of the sums of h_i q_j."""
     odd = products - products.T
     return 0.5 * torch.stack((odd[1, 0] + odd[3, 2], odd[2, 0] + odd[1, 3], odd[3, 0] + odd[2, 1]))
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxPosesSettings(EffectSettings):
+    """Called for where boxes of moving objects tremble. The rates of the corrections are those of the nodes.
+
+    Raises ValueError for a negative threshold.
+    """
+
+    threshold: float = 2.0
+    """Centimeters, standard deviation of a corner about its path (``evidence.boxes``)."""
+
+    smooth: bool = True
+    """Corrections start where boxes would lie on smooth paths (``geometry.smooth_paths``); false: at zero."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.threshold >= 0:
+            raise ValueError(f"threshold must be >= 0 cm, got {self.threshold}")
+
+    def detect(self, data: TrainingData) -> Finding:
+        moving = [track for track in data.log.tracks if displacement(track) > _MOVES]
+        found = box_jitter(moving, data.held_out)
+        if found is None:
+            # Two boxes tell no error from motion, and what boxes do at 2 frames a second is not known either.
+            wanted, reason = bool(moving), f"{len(moving)} objects of {data.log.name} move, in too few boxes to tell"
+            return Finding(called_for=wanted, reason=reason, unit="cm", threshold=self.threshold)
+        value, objects = 100 * found.value, len(found.by_track)
+        return Finding(
+            called_for=value >= self.threshold,
+            reason=f"corners of the boxes of {objects} moving objects lie {value:.1f} cm beside their paths",
+            value=value,
+            unit="cm",
+            threshold=self.threshold,
+            noise=None if math.isnan(found.error) else 100 * found.error,
+        )
+
+    def prepare(self, nodes: Iterable[Node], on: bool) -> None:
+        for node in nodes:
+            if isinstance(node, Tracked) and not on:
+                node.fix_boxes()
+            elif isinstance(node, Tracked) and self.smooth:
+                node.smooth_boxes()
+
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> Effect | None:
+        return None
+
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Effect:
+        raise ValueError(
+            "box poses are parts of nodes, and no scene lists them among its effects: write the file again"
+        )

@@ -1,13 +1,56 @@
-"""A table of Gaussians, in which every parameter and buffer has one entry per row."""
+"""The table of a node's Gaussians: which columns it has, its rows, and what happens to them when rows come and go."""
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from sparsestreet.scene.gaussians.plan import RowPlan
+
+@dataclass(frozen=True)
+class RowPlan:
+    """A plan by which new row i is a copy of old row source[i]; parameters, optimizer moments and buffers follow it.
+
+    Raises ValueError if a source is not a row of the table that the plan was made for.
+
+    >>> plan = RowPlan(rows=2, source=torch.tensor([0, 1, 1]), fresh=torch.tensor([False, False, True]))
+    >>> len(plan.source)
+    3
+    """
+
+    rows: int
+    """Number of rows of the table that the plan was made for; a stale plan must not be applied to another table."""
+    source: Int[Tensor, " new"]
+    fresh: Bool[Tensor, " new"]
+    """Whether a new row's optimizer moments start at zero."""
+    edits: dict[str, Tensor] = field(default_factory=dict)
+    """Name of a parameter or buffer -> values [new, ...] that replace its column, for rows that are not copies."""
+    reset_moments: frozenset[str] = frozenset()
+    """Names of parameters whose moments start at zero in every row (an opacity reset)."""
+    inherited_second_moments: frozenset[str] = frozenset()
+    """Names of parameters of which fresh rows begin with their source's second moments. With zeros, which Adam takes
+    for true after its first thousand steps, one gradient moves a parameter by 0.1 / sqrt(0.001) = 3.2 rates at once,
+    and by 32 until its first moment has died away."""
+
+    def __post_init__(self) -> None:
+        if len(self.source) != len(self.fresh):
+            raise ValueError(f"fresh must have one entry per new row: {len(self.fresh)} for {len(self.source)}")
+        if len(self.source) and not 0 <= int(self.source.min()) <= int(self.source.max()) < self.rows:
+            low, high = int(self.source.min()), int(self.source.max())
+            raise ValueError(f"the plan's sources {low} to {high} must lie in the table of {self.rows} rows")
+
+    @staticmethod
+    def keep(mask: Bool[Tensor, " old"]) -> "RowPlan":
+        """Returns the plan that keeps the rows where ``mask`` is true, in order.
+
+        >>> RowPlan.keep(torch.tensor([True, False, True])).source.tolist()
+        [0, 2]
+        """
+        source = torch.nonzero(mask).squeeze(-1)
+        return RowPlan(len(mask), source, torch.zeros_like(source, dtype=torch.bool))
 
 
 class Rows(nn.Module):
@@ -142,3 +185,70 @@ def _replace_in_optimizer(
                 moved[zero] = 0
             state[key] = moved
     optimizer.state[new] = state
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The rows that stay."""
+
+    keep: Bool[Tensor, " n"]
+    floor_hit: bool
+    """Whether K_min or the floor of an instance kept rows that the rule wanted to remove."""
+    removed: int
+
+    def plan(self) -> RowPlan:
+        """Returns the plan that keeps these rows in order, with their optimizer moments."""
+        return RowPlan.keep(self.keep)
+
+
+@dataclass(frozen=True)
+class InstanceFloors:
+    """The least number of rows of each instance of a node; an instance that has fewer keeps all."""
+
+    ids: Int[Tensor, " n"]
+    """Row -> its instance."""
+    least: Int[Tensor, " i"]
+
+
+def keep_best(
+    scores: Float[Tensor, " n"],
+    unwanted: Bool[Tensor, " n"],
+    min_gaussians: int,
+    instances: InstanceFloors | None = None,
+) -> Selection:
+    """Drops the unwanted rows, but keeps enough of them to meet the floors.
+
+    Each instance first fills up to its own floor. Then the best of the rest fill up to ``min_gaussians``. The highest
+    scores stay and, among rows of equal score, the lower row. Raises ValueError for scores that are NaN or a negative
+    floor.
+
+    >>> scores = torch.tensor([0.9, 0.1, 0.2])
+    >>> selection = keep_best(scores, unwanted=scores < 0.5, min_gaussians=2)
+    >>> selection.keep.tolist(), selection.floor_hit, selection.removed
+    ([True, False, True], True, 1)
+    """
+    if min_gaussians < 0:
+        raise ValueError(f"min_gaussians must be >= 0, got {min_gaussians}")
+    if scores.isnan().any():
+        row = int(scores.isnan().nonzero()[0])
+        raise ValueError(f"scores must be numbers, but row {row} of {scores.shape[0]} is NaN: repair it before pruning")
+    best_first = torch.sort(scores, descending=True, stable=True).indices
+    best_first = best_first[torch.sort(unwanted[best_first].byte(), stable=True).indices]
+    keep = ~unwanted
+    wanted = int(keep.sum())
+    if instances is not None:
+        keep[best_first[_within_floors(instances.ids[best_first], instances.least)]] = True
+    missing = max(min_gaussians - int(keep.sum()), 0)
+    keep[best_first[~keep[best_first]][:missing]] = True
+    kept = int(keep.sum())
+    return Selection(keep, floor_hit=kept > wanted, removed=scores.shape[0] - kept)
+
+
+def _within_floors(ids: Int[Tensor, " n"], least: Int[Tensor, " i"]) -> Bool[Tensor, " n"]:
+    """Returns whether each row is within its instance's floor, counted from the first row; rows come best first."""
+    by_instance = torch.sort(ids, stable=True)
+    counts = torch.bincount(ids, minlength=len(least))
+    place = torch.arange(len(ids), device=ids.device) - (counts.cumsum(0) - counts)[by_instance.values]
+    within = torch.zeros_like(ids, dtype=torch.bool)
+    within[by_instance.indices] = place < least[by_instance.values]
+    return within
