@@ -5,7 +5,6 @@ splats, the affine map one of their colors, the exposure a gain for each image; 
 brings, and what takes them away from it.
 """
 
-from sparsestreet.scene.effects.dirt import DirtSettings
 from sparsestreet.scene.effects.effect import (
     Cost,
     Effect,
@@ -19,7 +18,7 @@ from sparsestreet.scene.effects.effect import (
     plan_effects,
 )
 from sparsestreet.scene.effects.exposure import Affine, AffineSettings, Exposure, ExposureSettings
-from sparsestreet.scene.effects.hood import HoodSettings
+from sparsestreet.scene.effects.occluders import DirtSettings, HoodSettings
 from sparsestreet.scene.effects.optics import (
     Lens,
     LensSettings,

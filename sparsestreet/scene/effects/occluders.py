@@ -1,4 +1,4 @@
-"""The recording car in its own images: no part of the scene, but pixels that nothing is learned from."""
+"""What hides the street from a camera and moves with it: the recording car's hood, and dirt on the lens."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +12,17 @@ from sparsestreet.data.hood import LEAST_DRIVE
 from sparsestreet.pictures.images import Marked
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportedSettings(EffectSettings):
+    """The plan reports what is called for, and nothing is built for it."""
+
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> None:
+        return None
+
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Effect:
+        raise ValueError(f"no scene file holds what is only reported ({type(self).__name__}): train the scene again")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,3 +77,40 @@ def _shown(data: TrainingData) -> list[Marked]:
         found = f"hood, {100 * hood.share:.1f} % of the image" if hood.mask.any() else "no hood"
         panels.append(Marked(f"camera {camera}: {found}", own[len(own) // 2].image.numpy(), hood.mask.numpy()))
     return panels
+
+
+@dataclass(frozen=True, kw_only=True)
+class DirtSettings(ReportedSettings):
+    """Called for where dark spots stay in a camera's images while the street passes.
+
+    The log's frames have them in ``Frame.ego`` then (``StreetData``); the scene has no part of it.
+    """
+
+    min_share: float = 0.005
+    """Of an image's pixels."""
+
+    def detect(self, data: TrainingData) -> Finding:
+        spots, log = data.log.dirt, data.log
+        if not spots:
+            return Finding(
+                called_for=False,
+                reason=f"no camera of {log.name} moves by {LEAST_DRIVE:g} m, so what never changes may be the street",
+                unit="of an image",
+                threshold=self.min_share,
+                missing="read a longer drive, or give masks of the spots (data.log.masks)",
+            )
+        shares = {camera: float(each.mask.float().mean()) for camera, each in spots.items()}
+        camera = max(shares, key=shares.__getitem__)
+        count = sum(share >= self.min_share for share in shares.values())
+        return Finding(
+            called_for=count > 0,
+            reason=(
+                f"{count} of {log.num_cameras} cameras show dark spots that stay while returns of the lidar pass "
+                f"behind them; camera {camera} shows most"
+            ),
+            value=shares[camera],
+            unit="of an image",
+            threshold=self.min_share,
+            noise=spots[camera].error,
+            missing=None if shares[camera] > 0 else "give masks of the spots (data.log.masks), if the images show any",
+        )
