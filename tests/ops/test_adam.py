@@ -1,6 +1,7 @@
 """Both Adams, of finite and of visible rows: all backends against torch's optimizers, and what they refuse."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -40,7 +41,7 @@ def nothing_refused(device: torch.device) -> Tensor:
     return torch.tensor([0, NONE], device=device)
 
 
-def theirs(start: Tensor, gradients: list[Tensor], kind=torch.optim.Adam, **options) -> Fields:
+def theirs(start: Tensor, gradients: list[Tensor], kind: Any = torch.optim.Adam, **options) -> Fields:
     parameter = torch.nn.Parameter(start.clone())
     adam = kind([parameter], lr=LR, betas=BETAS, eps=EPS, **options)
     for parameter.grad in gradients:
@@ -107,7 +108,7 @@ def test_rows_whose_gradient_is_not_finite_keep_every_bit_and_are_counted(shape,
     results = []
     for given, counted in ((gradient, [3, 5]), (clean, [0, NONE])):
         fields, refused = [field.clone() for field in before], nothing_refused(start.device)
-        adam_rows_(fields[0], given, *fields[1:], refused, AdamStep(3, LR), width=width, backend=backend)
+        adam_rows_(fields[0], given, fields[1], fields[2], refused, AdamStep(3, LR), width=width, backend=backend)
         assert refused.tolist() == counted
         results.append(fields)
     others = torch.ones(rows, dtype=torch.bool, device=start.device).index_fill(0, bad, False)
@@ -183,7 +184,8 @@ def test_without_a_visible_number_nothing_changes(shape, visible, backend):
     fields = [torch.full(shape, value, device=device_of(backend)) for value in (1.0, 2.0, 3.0, 4.0)]
     before = [field.clone() for field in fields]
     mask = torch.full(shape[:1], visible, device=fields[0].device)
-    adam_step_(*fields, mask, AdamStep(1, LR), backend=backend)
+    parameter, gradient, exp_avg, exp_avg_sq = fields
+    adam_step_(parameter, gradient, exp_avg, exp_avg_sq, mask, AdamStep(1, LR), backend=backend)
     assert all(map(torch.equal, fields, before))
 
 

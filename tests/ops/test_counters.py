@@ -69,7 +69,8 @@ def test_of_equal_weights_the_nearer_splat_dominates(backend):
 @pytest.mark.parametrize(("stop", "size"), [("inclusive", (37, 53)), ("exclusive", (64, 17)), ("exclusive", (1, 1))])
 def test_backends_agree(size, stop, backend):
     interpreted = backend == "triton"
-    view = camera(*((17, 13) if interpreted else size), focal=40.0)
+    width, height = (17, 13) if interpreted else size
+    view = camera(width, height, focal=40.0)
     gaussians = random_gaussians(12 if interpreted else 300, view, seed=2)
     settings = SplatSettings(stop=stop, transmittance_min=0.02)
     single, given = cast(gaussians, torch.float32, device=device_of(backend)), of(backend, gaussians)
@@ -132,9 +133,9 @@ def test_against_images_without_the_row(backend, behind):
     )
     squared = changes.square().sum(-1) * (weights if behind else 1)
     assert (changes.abs().amax((1, 2, 3)) > 0.01).sum() > 3
-    bars = {"rtol": 1e-4, "atol": 1e-6} if backend == "triton" else {"rtol": 1e-9, "atol": 1e-12}
-    torch.testing.assert_close(found.max_abs_change.cpu().double(), changes.abs().amax((1, 2, 3)), **bars)
-    torch.testing.assert_close(found.squared_change.cpu().double(), squared.sum((1, 2)), **bars)
+    rtol, atol = (1e-4, 1e-6) if backend == "triton" else (1e-9, 1e-12)
+    torch.testing.assert_close(found.max_abs_change.cpu().double(), changes.abs().amax((1, 2, 3)), rtol=rtol, atol=atol)
+    torch.testing.assert_close(found.squared_change.cpu().double(), squared.sum((1, 2)), rtol=rtol, atol=atol)
 
 
 def test_weights_of_another_shape_are_refused():

@@ -25,7 +25,11 @@ IMAGE = torch.zeros(11, 11, 3)
 CAMERA = Camera(torch.eye(4), torch.eye(3), width=11, height=11)
 STEPS = {
     "adam": lambda backend: adam_rows_(
-        *torch.zeros(4, 2, 3), torch.zeros(2).long(), AdamStep(1, 0.1), width=3, backend=backend
+        *(torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 3)),
+        torch.zeros(2).long(),
+        AdamStep(1, 0.1),
+        width=3,
+        backend=backend,
     ),
     "activate": lambda backend: activate([ROWS], sh_degree=0, backend=backend),
     "poses": lambda backend: poses_at(TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend),

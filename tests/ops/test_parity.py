@@ -1,6 +1,7 @@
 """C++ and Triton against the float64 reference: images, radii and all gradients, by settings and effects."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -198,7 +199,7 @@ def test_pairs_behind_a_stack(stop, backend):
 @pytest.mark.parametrize("field", FIELDS)
 def test_finite_differences(field):
     view = camera(6, 5)
-    values = vars(random_gaussians(12, view, terms=9, seed=3)) | {"displacements": None}
+    values: dict[str, Any] = vars(random_gaussians(12, view, terms=9, seed=3)) | {"displacements": None}
     settings = SplatSettings(alpha_min=1e-9, antialias=True)
 
     def images(value: Tensor) -> tuple[Tensor, ...]:

@@ -53,7 +53,7 @@ CASES: dict[str, tuple[Tensor, Tensor]] = {
     "bright and flat": bright_and_flat(),
     "columns in two programs": noise(12, 60),
     "lines in two": noise(43, 11),
-    "small and flat": tuple(plane[:14, :16] for plane in bright_and_flat()),
+    "small and flat": (bright_and_flat()[0][:14, :16], bright_and_flat()[1][:14, :16]),
     "constant": (torch.full((18, 23, 3), 0.3).double(), torch.full((18, 23, 3), 0.7).double()),
 }
 

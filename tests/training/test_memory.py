@@ -66,7 +66,7 @@ def test_bytes_of_a_row_are_those_of_its_columns():
 
 @pytest.mark.parametrize(("free", "room"), [(1_000, 900.0), (None, float("inf"))])
 def test_room_on_the_host_is_what_is_free_less_a_margin(free, room, monkeypatch):
-    monkeypatch.setattr(forecast.free_memory, "free_bytes", lambda: free)
+    monkeypatch.setattr(forecast.frame_cache, "free_bytes", lambda: free)
     assert bytes_for_growth(torch.device("cpu")) == pytest.approx(room)
 
 
