@@ -14,7 +14,7 @@ _SAID = ("os error 28", "os error 27", "os error 122", "iostream error", "unexpe
 
 
 def check_regular(path: Path) -> None:
-    """Raises OSError for a pipe, a socket or a device, by a link too: who opens one may wait for ever.
+    """Raise OSError for a pipe, a socket or a device, by a link too: who opens one may wait for ever.
 
     What is not there is no matter of this check.
 
@@ -29,7 +29,7 @@ def check_regular(path: Path) -> None:
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yields a temporary path next to ``path``. Its file replaces ``path`` at the end, or goes if the block fails.
+    """Yield a temporary path next to ``path``. Its file replaces ``path`` at the end, or goes if the block fails.
 
     A block that writes nothing changes nothing. When several processes save together, only the first writes; the others
     enter the block too (``Trainer.save_checkpoint`` must be called by all), and change nothing.
@@ -71,7 +71,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Yields a temporary folder next to ``path``. It becomes ``path`` when the block ends, and is deleted if it fails.
+    """Yield a temporary folder next to ``path``. It becomes ``path`` when the block ends, and is deleted if it fails.
 
     Raises OSError before the block if nothing can be written, or if ``path`` is not an empty folder.
 

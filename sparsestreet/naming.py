@@ -10,7 +10,7 @@ LONGEST = 100
 
 
 def printable(text: str) -> str:
-    r"""Returns a text whose control characters are written out; lines and tabs stay.
+    r"""Return a text whose control characters are written out; lines and tabs stay.
 
     A terminal obeys them: it is cleared, renamed, or shows another text than stands there.
 
@@ -21,13 +21,13 @@ def printable(text: str) -> str:
 
 
 def one_line(name: str) -> str:
-    """Returns a name on one line, its control characters written out, cut where it is long."""
+    """Return a name on one line, its control characters written out, cut where it is long."""
     shown = "".join(one if one.isprintable() else repr(one)[1:-1] for one in name[: LONGEST + 1])
     return shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}..."
 
 
 def nearest(name: str, known: Iterable[str], most: int = 1, cutoff: float = 0.6) -> list[str]:
-    """Returns the known names that are most like one, the nearest first; long ones are compared by their beginnings.
+    """Return the known names that are most like one, the nearest first; long ones are compared by their beginnings.
 
     Args:
         name: what was written.

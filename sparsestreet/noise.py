@@ -37,7 +37,7 @@ class Calibration:
 
 
 def calibrate(device: torch.device) -> Calibration:
-    """Runs the loop on a device: 30 rounds of cosines, after 30 that do not count.
+    """Run the loop on a device: 30 rounds of cosines, after 30 that do not count.
 
     >>> calibrate(torch.device("cpu")).milliseconds > 0
     True
@@ -68,12 +68,12 @@ def noise_between(before: Calibration, after: Calibration) -> Noise:
 
 
 def named_seed(seed: int, name: str) -> int:
-    """Returns the seed of the stream with this name."""
+    """Return the seed of the stream with this name."""
     return seed + zlib.crc32(name.encode())
 
 
 def named_generator(seed: int, name: str) -> torch.Generator:
-    """Returns the random stream of the part with this name; it does not depend on what other parts draw.
+    """Return the random stream of the part with this name; it does not depend on what other parts draw.
 
     >>> one, again, other = (named_generator(0, name) for name in ("sky", "sky", "field"))
     >>> one.initial_seed() == again.initial_seed(), one.initial_seed() == other.initial_seed()

@@ -79,7 +79,7 @@ class Timeline:
         self._marks.append((self._clock.mark(), self._names[-1]))
 
     def begin(self) -> None:
-        """Starts anew."""
+        """Start anew."""
         del self._names[1:]
         self._marks = [(self._clock.mark(), self._names[0])]
 
@@ -99,7 +99,7 @@ class PhaseRecorder(Timeline):
         super().__init__(clock, outside)
 
     def start(self) -> None:
-        """Records from now on; raises RuntimeError while another recorder does."""
+        """Record from now on; raise RuntimeError while another recorder does."""
         global _recorder
         if _recorder not in (None, self):
             raise RuntimeError("phases are recorded by one recorder at a time: stop the other one first")
@@ -107,7 +107,7 @@ class PhaseRecorder(Timeline):
         self.begin()
 
     def stop(self) -> dict[str, float]:
-        """Returns the seconds of each phase since ``start``; they add up to the whole time."""
+        """Return the seconds of each phase since ``start``; they add up to the whole time."""
         global _recorder
         _recorder = None
         return self.seconds()
@@ -125,7 +125,7 @@ class StageRecorder(Timeline):
             self._marks.insert(0, (since, "start"))
 
     def go_on(self, earlier: Mapping[str, float]) -> None:
-        """Adds what an earlier command spent on the same run."""
+        """Add what an earlier command spent on the same run."""
         self._earlier = Counter(earlier)
 
     def seconds(self) -> dict[str, float]:

@@ -72,7 +72,7 @@ class Ranks:
 
     @contextmanager
     def answering(self) -> Iterator[None]:
-        """Turns the many words of a collective that fails into one sentence."""
+        """Turn the many words of a collective that fails into one sentence."""
         try:
             yield
         except RuntimeError as error:  # all that torch.distributed raises

@@ -32,7 +32,7 @@ class Block:
 def blend_torch(
     splats: Splats, width: int, height: int, settings: SplatSettings
 ) -> tuple[Float[Tensor, "h w 3"], Float[Tensor, "h w"]]:
-    """Returns color (premultiplied) and transmittance; splats must come nearest first."""
+    """Return color (premultiplied) and transmittance; splats must come nearest first."""
     tiles_x, tiles_y = -(-width // TILE), -(-height // TILE)
     image = splats.means.new_zeros(tiles_x * tiles_y, TILE * TILE, 4)
     image[..., 3] = 1

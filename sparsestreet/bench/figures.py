@@ -40,7 +40,7 @@ LEAST_ERROR = 1e-8
 
 
 def draw_pareto(records: Sequence[Record], folder: Path) -> list[Path]:
-    """Draws two figures with one panel per scene: image error against forward time, gradient error against whole time.
+    """Draw two figures with one panel per scene: image error against forward time, gradient error against whole time.
 
     Filled points are the default's model and form the front. Hollow points are another model (blur, clamp, effects),
     with errors against their own exact version. Presets carry their names.
@@ -138,7 +138,7 @@ def _blank_figure(width: float, height: float, x_label: str, y_label: str) -> Fi
 
 
 def _legend(place: Axes, panels: Sequence[Axes]) -> None:
-    """Draws one legend for all panels in a place of its own."""
+    """Draw one legend for all panels in a place of its own."""
     handles: dict[str, Artist] = {}
     for axes in panels:
         handles |= dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
@@ -147,7 +147,7 @@ def _legend(place: Axes, panels: Sequence[Axes]) -> None:
 
 
 def _pareto_panel(axes: Axes, points: Sequence[PlottedPoint]) -> list[PlottedPoint]:
-    """Draws a scene; returns the points to be named: presets and the front."""
+    """Draw a scene; return the points to be named: presets and the front."""
     own = [point for point in points if not point[2]["other_model"]]
     front = [own[index] for index in pareto_front([point[:2] for point in own])]
     x, y = [point[0] for point in front], [point[1] for point in front]
@@ -188,7 +188,7 @@ def _steps(front: Sequence[PlottedPoint]) -> list[PlottedPoint]:
 
 
 def _label(axes: Axes, points: Sequence[PlottedPoint]) -> None:
-    """Writes names next to points. If names would overlap, the later one moves up or down to the next free place."""
+    """Write names next to points. If names would overlap, the later one moves up or down to the next free place."""
     _ = axes.get_xlim(), axes.get_ylim()  # fixes the limits, and with them the transform to pixels
     bottom, top, end_of_panel = (float(side) for side in (axes.bbox.y0, axes.bbox.y1, axes.bbox.x1))
     pixel = 72 / axes.figure.dpi

@@ -43,7 +43,7 @@ class RecordFile:
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """Reads all lines of a file. Raises RecordError, naming file and line, for anything but strict JSON."""
+    """Read all lines of a file. Raises RecordError, naming file and line, for anything but strict JSON."""
     lines = path.read_text(encoding="utf-8").splitlines()
     return [cast("dict[str, Any]", parsed(line, f"{path}:{number}")) for number, line in enumerate(lines, start=1)]
 

@@ -113,7 +113,7 @@ def _facades(draw: _Draw, count: int) -> _Part:
 
 
 def _cars(draw: _Draw, count: int) -> _Part:
-    """Splats on the sides of boxes: one coordinate of each is moved to the surface."""
+    """Splat on the sides of boxes: one coordinate of each is moved to the surface."""
     place, half = torch.tensor(_CARS), torch.tensor([0.9, 0.75, 2.1])
     chosen = draw.pick(len(_CARS), count)
     inside = draw.between(-1, 1, count, 3)

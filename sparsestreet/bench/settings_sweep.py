@@ -217,7 +217,7 @@ def run_sweep(
     file: RecordFile,
     say: Callable[[str], None] = print,
 ) -> None:
-    """Measures all points of all scenes into ``file``.
+    """Measure all points of all scenes into ``file``.
 
     On the ``small`` copies the truth itself is checked, and the dense reference is timed next to the C++ backend
     (``small`` records). Raises RuntimeError with the remedy if the C++ backend, which computes the truths, is not
@@ -256,7 +256,7 @@ def _measure_points(
 
 
 def measure_point(scene: BenchScene, point: Point, truths: Truths, budget: TimingBudget) -> KnobRecord:
-    """Measures time and error of one point, or says why that is impossible here."""
+    """Measure time and error of one point, or say why that is impossible here."""
     record = _unmeasured(scene, point)
     if record.skipped is not None:
         return record
@@ -327,7 +327,7 @@ def unavailable(scene: BenchScene, point: Point) -> str | None:
 
 
 def check_oracle(scene: BenchScene) -> OracleRecord:
-    """Compares two truths: two implementations of the exact model in float64."""
+    """Compare two truths: two implementations of the exact model in float64."""
     exact = SplatSettings.preset("exact")
     fast, dense = (
         answer(scene.gaussians, scene.camera, exact, backend, torch.float64)

@@ -60,7 +60,7 @@ _OP, _REST, _FLOOR = "#0072B2", "#E69F00", "#333333"
 
 
 def draw_step(record: StepRecord, folder: Path) -> list[Path]:
-    """Draws median milliseconds of each phase that takes at least a hundredth of the step, the longest on top."""
+    """Draw median milliseconds of each phase that takes at least a hundredth of the step, the longest on top."""
     shown = [phase for phase in record.phases if phase.time.median >= 0.01 * record.step.median]
     figure = Figure(figsize=(8.0, 1.3 + 0.34 * len(shown)), dpi=130, layout="constrained")
     FigureCanvasAgg(figure)
@@ -163,7 +163,7 @@ def run_step(
     folder: Path,
     say: Callable[[str], None] = print,
 ) -> StepRecord:
-    """Trains through a window, writes the record and draws it.
+    """Train through a window, write the record and draw it.
 
     Args:
         what: name of what is trained, in words.

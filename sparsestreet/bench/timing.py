@@ -52,14 +52,14 @@ class TimingBudget:
     least: int = 3
 
     def warm_up(self, run: Callable[[], None]) -> None:
-        """Runs twice, or once if that takes long, without counting: buffers grow, code is compiled."""
+        """Run twice, or once if that takes long, without counting: buffers grow, code is compiled."""
         start = time.perf_counter()
         run()
         if time.perf_counter() - start < self.seconds / self.least:
             run()
 
     def runs(self, run: Callable[[], None]) -> None:
-        """Calls ``run`` as often as the budget allows."""
+        """Call ``run`` as often as the budget allows."""
         start = time.perf_counter()
         for done in range(self.repeats):
             if done >= self.least and time.perf_counter() - start > self.seconds:
@@ -80,7 +80,7 @@ class Cotangent:
 
     @staticmethod
     def of(camera: Camera, like: Tensor, seed: int = 1) -> "Cotangent":
-        """Draws standard normal numbers, in float64 so that every dtype and device gets the same."""
+        """Draw standard normal numbers, in float64 so that every dtype and device gets the same."""
         generator = torch.Generator().manual_seed(seed)
         values = torch.randn(camera.height, camera.width, 4, generator=generator, dtype=torch.float64).to(like)
         return Cotangent(values[..., :3].contiguous(), values[..., 3].contiguous())

@@ -26,18 +26,18 @@ class Cursor:
         return len(self._content) - self._place
 
     def take(self, count: int) -> bytes:
-        """Returns the next bytes. Raises ValueError where there are fewer."""
+        """Return the next bytes. Raises ValueError where there are fewer."""
         if count > self.left:
             raise ValueError(f"{count} bytes should follow, {self.left} are left: it is damaged")
         self._place += count
         return self._content[self._place - count : self._place]
 
     def numbers(self, form: str) -> tuple:
-        """Returns the next numbers, in a form of the module ``struct``."""
+        """Return the next numbers, in a form of the module ``struct``."""
         return struct.unpack(form, self.take(struct.calcsize(form)))
 
     def finish(self) -> None:
-        """Raises ValueError where bytes are left over."""
+        """Raise ValueError where bytes are left over."""
         if self.left:
             raise ValueError(f"{self.left} bytes are left over: it is damaged")
 
@@ -48,7 +48,7 @@ _DIFFERENCES = 0x80
 
 
 def packed(table: Integer[np.ndarray, "n c"]) -> list[bytes]:
-    """Returns the bytes of a table of int64 values, a piece a column; their concatenation is what is read.
+    """Return the bytes of a table of int64 values, a piece a column; their concatenation is what is read.
 
     Small values of both signs become small numbers first (0, -1, 1, -2 ... are 0, 1, 2, 3), so that their high bytes
     are zeros. A column is one byte, the number of bytes a value, and then one byte of each row after the other. Where
@@ -69,7 +69,7 @@ def packed(table: Integer[np.ndarray, "n c"]) -> list[bytes]:
 
 
 def unpacked(cursor: Cursor, rows: int, columns: int) -> Integer[np.ndarray, "n c"]:
-    """Returns the table from where its bytes begin. Raises ValueError where they are not such a table's."""
+    """Return the table from where its bytes begin. Raises ValueError where they are not such a table's."""
     table = np.empty((rows, columns), np.int64)
     for index in range(columns):
         (first,) = cursor.take(1)
@@ -89,7 +89,7 @@ def _folded(column: Integer[np.ndarray, " n"]) -> Integer[np.ndarray, " n"]:
 
 
 def _bits(column: Integer[np.ndarray, " n"]) -> float:
-    """Returns about how many bits entropy coding of single bytes would need."""
+    """Return about how many bits entropy coding of single bytes would need."""
     folded = _folded(column)
     low, high = folded & np.uint64(0xFF), (folded >> np.uint64(8)) & np.uint64(0xFF)
     return sum(_entropy(part) for part in (low, high)) + 16.0 * float((folded >> np.uint64(16) > 0).sum())
@@ -108,7 +108,7 @@ TYPES = INTEGERS + FLOATS
 
 
 def packed_column(values: Shaped[np.ndarray, "n ..."], step: float | None = None) -> list[bytes]:
-    """Returns the bytes of an array in pieces.
+    """Return the bytes of an array in pieces.
 
     With a step, each number is kept in whole steps. Raises ValueError for a type that is none of ``TYPES``.
     """
@@ -128,7 +128,7 @@ def packed_column(values: Shaped[np.ndarray, "n ..."], step: float | None = None
 def unpacked_column(
     cursor: Cursor, rows: int, shape: tuple[int, ...], dtype: str, step: float | None = None
 ) -> Shaped[np.ndarray, "n ..."]:
-    """Returns the array from where its bytes begin. Raises ValueError for damaged bytes or another type."""
+    """Return the array from where its bytes begin. Raises ValueError for damaged bytes or another type."""
     if dtype not in TYPES or (step is not None and dtype not in FLOATS):
         raise ValueError(f"arrays hold {', '.join(TYPES)}, got {dtype!r} with a step of {step}: it is damaged")
     width = int(np.prod(shape, dtype=np.int64))

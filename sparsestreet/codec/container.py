@@ -38,7 +38,7 @@ class Budget:
         return FREE + PER_BYTE * self._file_size
 
     def take(self, count: int) -> None:
-        """Asks for so many bytes more, before they are allocated. Raises ValueError beyond the limit."""
+        """Ask for so many bytes more, before they are allocated. Raises ValueError beyond the limit."""
         self._taken += count
         if count < 0 or self._taken > self.limit:
             raise ValueError(
@@ -77,7 +77,7 @@ class FrameWriter:
             self._write(_END, [struct.pack("<I", self._count)])
 
     def write(self, tag: str, pieces: Sequence[bytes]) -> int:
-        """Writes a frame and returns the bytes that it takes; statistics of a piece serve this piece alone.
+        """Write a frame and return the bytes that it takes; statistics of a piece serve this piece alone.
 
         Raises ValueError for more than ``MAX_FRAME`` bytes.
         """
@@ -113,12 +113,12 @@ class FrameReader:
             raise ValueError(f"it has version {version} of the format, this program reads {VERSION}: export it again")
 
     def read(self, tag: str) -> bytes:
-        """Returns the content of the next frame, which must have this tag."""
+        """Return the content of the next frame, which must have this tag."""
         self._count += 1
         return self._read(tag.encode("ascii"))
 
     def finish(self) -> None:
-        """Reads the last frame. Raises ValueError where frames are missing or bytes follow."""
+        """Read the last frame. Raises ValueError where frames are missing or bytes follow."""
         (count,) = struct.unpack("<I", self._read(_END))
         if count != self._count or self._file.read(1):
             raise ValueError(f"it has {count} parts by its own count, and {self._count} were read: it is damaged")

@@ -82,7 +82,7 @@ class OtherColumn:
 
 
 def packed_block(block: Block, form: Form, steps: Steps) -> list[bytes]:
-    """Returns the bytes of a block in pieces, a column each. Its means must fit a grid of this step (``fits``)."""
+    """Return the bytes of a block in pieces, a column each. Its means must fit a grid of this step (``fits``)."""
     order, parts = vectors.packed_points(block.means, steps.position)
     opacities = 1 / (1 + np.exp(-np.clip(block.opacity_logits[order], -80, 80)))
     levels = np.rint(LEVELS * opacities).astype(np.int64)
@@ -103,12 +103,12 @@ def packed_block(block: Block, form: Form, steps: Steps) -> list[bytes]:
 
 
 def rows_in(content: bytes) -> int:
-    """Returns the number of rows of a block, known before it is unpacked."""
+    """Return the number of rows of a block, known before it is unpacked."""
     return int.from_bytes(Cursor(content).take(4), "little")
 
 
 def unpacked_block(content: bytes, form: Form) -> Block:
-    """Returns the rows that ``packed_block`` was given, in another order. Raises ValueError for damaged bytes."""
+    """Return the rows that ``packed_block`` was given, in another order. Raises ValueError for damaged bytes."""
     cursor = Cursor(content)
     rows, size = int.from_bytes(cursor.take(4), "little"), len(form.axes)
     with np.errstate(all="ignore"):  # a damaged number overflows; the check below says so
@@ -133,7 +133,7 @@ def unpacked_block(content: bytes, form: Form) -> Block:
 
 
 def _grades(levels: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " n"]:
-    """Returns how often an opacity was halved, rounded, at most ``_GRADES`` times."""
+    """Return how often an opacity was halved, rounded, at most ``_GRADES`` times."""
     table = np.rint(-np.log2(np.maximum(np.arange(LEVELS + 1), 0.5) / LEVELS)).astype(np.int64)
     return np.minimum(table, _GRADES)[levels]
 

@@ -22,7 +22,7 @@ _SPREAD = (
 
 
 def curve_order(points: Float64[np.ndarray, "n 3"]) -> Int64[np.ndarray, " n"]:
-    """Returns the rows along Morton's curve through the box of all points."""
+    """Return the rows along Morton's curve through the box of all points."""
     if not len(points):
         return np.zeros(0, np.int64)
     low = points.min(0)
@@ -36,7 +36,7 @@ def fits(points: Float64[np.ndarray, "n 3"], step: float) -> bool:
 
 
 def packed_points(points: Float64[np.ndarray, "n 3"], step: float) -> tuple[Int64[np.ndarray, " n"], list[bytes]]:
-    """Returns the order in which points are stored, and their bytes; each coordinate is off by half a step at most.
+    """Return the order in which points are stored, and their bytes; each coordinate is off by half a step at most.
 
     ``points`` must fit (``fits``).
     """
@@ -48,7 +48,7 @@ def packed_points(points: Float64[np.ndarray, "n 3"], step: float) -> tuple[Int6
 
 
 def unpacked_points(cursor: Cursor, rows: int) -> Float64[np.ndarray, "n 3"]:
-    """Returns the points from where their bytes begin, in the stored order."""
+    """Return the points from where their bytes begin, in the stored order."""
     step, *low = cursor.numbers("<4d")
     codes = np.cumsum(unpacked(cursor, rows, 1)[:, 0]).astype(np.uint64)
     return np.array(low) + step * _grid(codes)
@@ -79,7 +79,7 @@ _BLOCK = 8192
 
 
 def _cube_rotations() -> Float64[np.ndarray, "24 4"]:
-    """Returns the rotations of a cube as unit quaternions, wxyz, one of each pair q and -q."""
+    """Return the rotations of a cube as unit quaternions, wxyz, one of each pair q and -q."""
     found = []
     for numbers in itertools.product((-1, 0, 1), repeat=4):
         length = sum(abs(number) for number in numbers)
@@ -108,7 +108,7 @@ _ORDERS = _axis_orders(_CUBE)
 def nearest_turn(
     quaternions: Float64[np.ndarray, "n 4"],
 ) -> tuple[Float64[np.ndarray, "n 3"], Int64[np.ndarray, "n 3"]]:
-    """Returns Rodrigues vectors, and for each row the order of axes that its scales must be put in.
+    """Return Rodrigues vectors, and for each row the order of axes that its scales must be put in.
 
     Quaternions are wxyz, of any length; one of no length turns nothing.
 
@@ -130,7 +130,7 @@ def nearest_turn(
 
 
 def quaternions_of(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 4"]:
-    """Returns unit quaternions, wxyz.
+    """Return unit quaternions, wxyz.
 
     >>> quaternions_of(np.zeros((1, 3))).tolist()
     [[1.0, 0.0, 0.0, 0.0]]
@@ -140,7 +140,7 @@ def quaternions_of(vectors: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "
 
 
 def _products(quaternions: Float64[np.ndarray, "n 4"]) -> Float64[np.ndarray, "n 24 4"]:
-    """Returns each quaternion times each rotation of the cube."""
+    """Return each quaternion times each rotation of the cube."""
     aw, ax, ay, az = (part[:, None] for part in quaternions.T)
     bw, bx, by, bz = _CUBE.T
     return np.stack(
@@ -158,26 +158,26 @@ _UNIT = 2**15 - 1
 
 
 def principal_axes(second_moments: Float64[np.ndarray, "d d"]) -> Int16[np.ndarray, "d d"]:
-    """Returns a column for each axis, the one of most energy first, in units of 1 / 32767."""
+    """Return a column for each axis, the one of most energy first, in units of 1 / 32767."""
     _, axes = np.linalg.eigh(second_moments)
     return np.rint(axes[:, ::-1] * _UNIT).astype(np.int16)
 
 
 def along_axes(values: Float64[np.ndarray, "n d"], axes: Int16[np.ndarray, "d d"]) -> Float64[np.ndarray, "n d"]:
-    """Returns the values in axes that are rounded, and so not quite orthogonal: ``from_axes`` gives them back."""
+    """Return the values in axes that are rounded, and so not quite orthogonal: ``from_axes`` gives them back."""
     return np.linalg.solve(axes / _UNIT, values.T).T
 
 
 def from_axes(values: Float64[np.ndarray, "n d"], axes: Int16[np.ndarray, "d d"]) -> Float64[np.ndarray, "n d"]:
-    """Returns what ``along_axes`` was given."""
+    """Return what ``along_axes`` was given."""
     return values @ (axes / _UNIT).T
 
 
 def packed_axes(axes: Int16[np.ndarray, "d d"]) -> bytes:
-    """Returns the bytes of the axes."""
+    """Return the bytes of the axes."""
     return axes.astype("<i2").tobytes()
 
 
 def unpacked_axes(cursor: Cursor, size: int) -> Int16[np.ndarray, "d d"]:
-    """Returns the axes from where their bytes begin."""
+    """Return the axes from where their bytes begin."""
     return np.frombuffer(cursor.take(2 * size * size), "<i2").reshape(size, size).astype(np.int16)

@@ -120,7 +120,7 @@ def convert(
 
 
 def check_free(folder: Path) -> None:
-    """Raises OSError where something is in the way of a folder."""
+    """Raise OSError where something is in the way of a folder."""
     if folder.is_dir() and not any(folder.iterdir()):
         return
     if os.path.lexists(folder):

@@ -79,7 +79,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def check_pixels(path: Path, *, decode: bool) -> None:
-    """Raises LogError where the file cannot be decoded; without ``decode`` only what looks cut short is tried."""
+    """Raise LogError where the file cannot be decoded; without ``decode`` only what looks cut short is tried."""
     if decode or not path.is_file() or not _ends_well(path):
         _opened(path, partial(colors, path=path))
 
@@ -127,7 +127,7 @@ def check_image_sizes(camera: str | int, size: tuple[int, int], images: Sequence
 
 
 def check_mask(path: Path, size: tuple[int, int], *, decode: bool) -> None:
-    """Raises LogError for a mask of another (width, height), and if ``decode`` for pixels that are no mask."""
+    """Raise LogError for a mask of another (width, height), and if ``decode`` for pixels that are no mask."""
     found = image_size(path)
     if found != size:
         message = f"the mask is {found[0]}x{found[1]}, the camera's images are {size[0]}x{size[1]}"

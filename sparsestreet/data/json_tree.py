@@ -54,12 +54,12 @@ class JsonValue:
         return self
 
     def unread(self, known: Collection[str]) -> list[str]:
-        """Names of an object's entries that are none of ``known``; null counts as absent."""
+        """Name of an object's entries that are none of ``known``; null counts as absent."""
         self._must_be(dict, "an object in braces")
         return [key for key in self.value if key in self and key not in known]
 
     def entries(self) -> Iterator[tuple[str, "JsonValue"]]:
-        """Names and values of an object, in its order."""
+        """Name and values of an object, in its order."""
         self._must_be(dict, "an object in braces")
         return ((key, self[key]) for key in self.value if key in self)
 

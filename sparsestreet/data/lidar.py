@@ -25,7 +25,7 @@ _FARTHEST = 1000.0
 
 
 def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "drop these returns") -> None:
-    """Raises LogError, naming the file, unless all points, in the frame of their sensor, are where lidar can see.
+    """Raise LogError, naming the file, unless all points, in the frame of their sensor, are where lidar can see.
 
     Those at the sensor itself pass: many drivers write zeros where nothing came back (``returned``).
     """

@@ -355,7 +355,7 @@ def _inside_shares(log: DrivingLog) -> list[tuple[Track, Float[Tensor, " boxes"]
 
 
 def _counted(points: Float64[Tensor, "n 3"], size: Float[Tensor, "3"]) -> Float[Tensor, "boxes 2"]:
-    """Returns inside of each of ``_OTHER_BOXES``, and in the shell around it, the road near its floor left out.
+    """Return inside of each of ``_OTHER_BOXES``, and in the shell around it, the road near its floor left out.
 
     Far below the floor there is nothing: the shell goes on from twice ``_FLOOR`` below it.
     """

@@ -42,7 +42,7 @@ def rigid_poses(
 
 
 def check_rigid(pose: Float64[Tensor, "4 4"], path: Path, what: str) -> None:
-    """Raises LogError unless the matrix is finite and a rotation and translation."""
+    """Raise LogError unless the matrix is finite and a rotation and translation."""
     if not torch.isfinite(pose).all():
         raise fault(path, f"{what} holds NaN or infinity", "write the pose again, or leave its frame out")
     error = rigidity_error(pose)

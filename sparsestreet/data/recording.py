@@ -78,7 +78,7 @@ class SceneFolder:
         self._use(tracks, frozenset())
 
     def _use(self, others: Sequence[Track], held_out: frozenset[int]) -> None:
-        """Sets the objects that carry points of frames which are not held out, and forgets what others carried."""
+        """Set the objects that carry points of frames which are not held out, and forgets what others carried."""
         self._others, self._held_out = tuple(others), held_out
         self._frames = FrameCache(self._read_frame, self._cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.

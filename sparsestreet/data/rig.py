@@ -53,7 +53,7 @@ class Undistortion:
         return Undistortion(*places)
 
     def __call__(self, pixels: np.ndarray) -> np.ndarray:
-        """Returns an image or a mask [h, w, ...] without the lens, interpolated bilinearly.
+        """Return an image or a mask [h, w, ...] without the lens, interpolated bilinearly.
 
         What the camera did not record is black.
         """
@@ -234,7 +234,7 @@ def check_lens_camera(path: Path, lens: Lens, size: tuple[int, int]) -> None:
 def check_lens(
     path: Path, intrinsics: Float64[Tensor, "3 3"], distortion: Float64[Tensor, "5"], size: tuple[int, int]
 ) -> None:
-    """Raises LogError, naming the file of the calibration, unless the lens has an inverse everywhere in the image."""
+    """Raise LogError, naming the file of the calibration, unless the lens has an inverse everywhere in the image."""
     if not distortion.any():
         return
     try:

@@ -42,7 +42,7 @@ class Light:
 
     @property
     def stops(self) -> float:
-        """Stops of the stored values by which the median image lies below middle gray."""
+        """Stop of the stored values by which the median image lies below middle gray."""
         return math.log2(_MIDDLE_GRAY / max(self.level, 0.5))
 
     def numbers(self) -> dict[str, float]:

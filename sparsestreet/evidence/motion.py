@@ -165,7 +165,7 @@ class BoxJitter:
 
 
 def box_jitter(tracks: Sequence[Track], held_out: frozenset[int]) -> BoxJitter | None:
-    """Measures how far corners lie from the paths through their neighbors; None where too few boxes follow each other.
+    """Measure how far corners lie from the paths through their neighbors; None where too few boxes follow each other.
 
     With differences of order k, over sqrt((2k)! / k!^2), independent errors keep their size. A car that accelerates has
     none of order 3, and at 2 frames a second its jerk has few of order 4. The least of the orders is taken, and of each

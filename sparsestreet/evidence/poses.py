@@ -171,7 +171,7 @@ class _Stretch:
 
 
 def pose_noise(frames: Frames, moving: Sequence[Track]) -> PoseNoise | None:
-    """Looks at a few stretches of the drive; None where no image shows enough points, as when the car stands.
+    """Look at a few stretches of the drive; None where no image shows enough points, as when the car stands.
 
     The rays of points that SIFT finds in several images meet if poses are right. A bundle adjustment of each stretch
     says how each image has to move for it. Errors of an image are what its correction differs by from those before and

@@ -31,7 +31,7 @@ _NEAREST_SKY_DOME, _FARTHEST_SKY_DOME = 500.0, 5000.0
 
 
 def dome_around(scene: SceneGraph, parts: Sequence[Part]) -> Cloud | None:
-    """Returns the sky of a scene around all its parts; None if it has none."""
+    """Return the sky of a scene around all its parts; None if it has none."""
     for effect in scene.effects.values():
         if isinstance(effect, Sky):
             reaches = [float(np.abs(shape.centers).max()) for part in parts for shape in part.shapes]
@@ -41,7 +41,7 @@ def dome_around(scene: SceneGraph, parts: Sequence[Part]) -> Cloud | None:
 
 @torch.no_grad()
 def sky_dome(sky: Sky, radius: float, count: int = 12_000) -> Cloud:
-    """Returns discs on a sphere about the origin, meters, each of the color of the sky behind it.
+    """Return discs on a sphere about the origin, meters, each of the color of the sky behind it.
 
     The discs are evenly spread along a spiral (Fibonacci lattice), sqrt(4 pi / count) radians apart: 1.9 degrees for
     12,000.
@@ -82,7 +82,7 @@ def frame_gaussians(
     instances: Collection[str] | None = None,
     sky: bool = True,
 ) -> Gaussians:
-    """Returns the scene at a time in [0, 1] in the axes of viewers, those that are never seen left out.
+    """Return the scene at a time in [0, 1] in the axes of viewers, those that are never seen left out.
 
     ``sky`` adds the dome where the whole scene is taken. Raises as ``scene_gaussians``, and ValueError where nothing is
     left.
@@ -100,13 +100,13 @@ def frame_gaussians(
 
 
 def selected(gaussians: Gaussians, rows: Tensor) -> Gaussians:
-    """Returns some rows, on the host."""
+    """Return some rows, on the host."""
     names = ("means", "quaternions", "scales", "opacities", "sh")
     return Gaussians(*(getattr(gaussians, name)[rows].detach().cpu() for name in names))
 
 
 def turned(gaussians: Gaussians, rotation: Float[Tensor, "3 3"]) -> Gaussians:
-    """Returns the Gaussians as they are seen from axes that are turned: new = rotation @ old, harmonics as well."""
+    """Return the Gaussians as they are seen from axes that are turned: new = rotation @ old, harmonics as well."""
     turn = quat.from_matrix(rotation[None].double()).to(gaussians.quaternions)
     terms = gaussians.sh.shape[1]
     return replace(
@@ -118,7 +118,7 @@ def turned(gaussians: Gaussians, rotation: Float[Tensor, "3 3"]) -> Gaussians:
 
 
 def turned_harmonics(rotation: Float[Tensor, "3 3"], terms: int) -> Float[Tensor, "k k"]:
-    """Returns the matrix that turns coefficients: colors along ``rotation @ d`` are those along d before.
+    """Return the matrix that turns coefficients: colors along ``rotation @ d`` are those along d before.
 
     Solved from the basis at many directions, which no convention of signs can get wrong.
     """
@@ -130,7 +130,7 @@ def turned_harmonics(rotation: Float[Tensor, "3 3"], terms: int) -> Float[Tensor
 
 
 def _discs(cloud: Cloud, terms: int) -> Gaussians:
-    """Returns the discs of a dome, whose thin axis is the last one."""
+    """Return the discs of a dome, whose thin axis is the last one."""
     variances, axes = torch.linalg.eigh(torch.from_numpy(cloud.covariances).double())
     axes = torch.where(torch.linalg.det(axes)[:, None, None] < 0, -axes, axes)
     colors = torch.zeros(len(cloud), terms, 3)

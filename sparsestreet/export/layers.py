@@ -31,7 +31,7 @@ _COLUMN = "images_seen"
 
 @torch.no_grad()
 def count_images(stored: StoredScene, views: Iterable[View]) -> None:
-    """Gives the rows of all nodes a column: the number of views in which a Gaussian shows.
+    """Give the rows of all nodes a column: the number of views in which a Gaussian shows.
 
     It shows where it has the largest part of at least one pixel, as in the paper's importance. What another Gaussian
     hides has no such pixel. Objects that are edited, moved or copied later take their counts along.
@@ -51,7 +51,7 @@ def count_images(stored: StoredScene, views: Iterable[View]) -> None:
 
 
 def images_seen(scene: SceneGraph, spans: Mapping[str, slice]) -> Float[Tensor, " n"]:
-    """Returns the counts in the order of a rendering's rows; 0 for what the recorded images never had.
+    """Return the counts in the order of a rendering's rows; 0 for what the recorded images never had.
 
     Raises ValueError where no node has counts.
     """
@@ -75,7 +75,7 @@ class LidarReturns:
         self._read: tuple[int, Float[Tensor, "n 3"]] | None = None
 
     def points(self, time: float) -> Float[Tensor, "n 3"]:
-        """Returns of the sweep that is nearest in time, in the world; cameras of an instant share one reading."""
+        """Return of the sweep that is nearest in time, in the world; cameras of an instant share one reading."""
         frame = min(self.times, key=lambda frame: abs(self.times[frame] - time))
         if self._read is None or self._read[0] != frame:
             self._read = frame, self._load(frame).points
@@ -130,7 +130,7 @@ class Instance:
 
 
 def instance_table(stored: StoredScene) -> list[Instance]:
-    """Returns all objects of a scene; their ids start at 1, in the order of nodes and of their tracks."""
+    """Return all objects of a scene; their ids start at 1, in the order of nodes and of their tracks."""
     found: list[Instance] = []
     for node_name, node in stored.scene.nodes.items():
         objects = node.instances()
@@ -145,7 +145,7 @@ def instance_table(stored: StoredScene) -> list[Instance]:
 def layer_values(
     stored: StoredScene, view: View, layers: Sequence[str], returns: LidarReturns | None = None
 ) -> dict[str, Values]:
-    """Returns the layers of a view, by name; see ``Values``.
+    """Return the layers of a view, by name; see ``Values``.
 
     A pixel shows the node, or the object, that has the largest part of its color. Id 0 is what is none of them: the
     sky, and for objects all that is no object. The layer ``lidar`` is made of the log's ``returns``, not of the scene:
@@ -177,7 +177,7 @@ def layer_values(
 
 
 def layer_picture(layer: str, values: Values, nodes: Sequence[str], under: Picture | None = None) -> Picture:
-    """Returns a layer in colors: near is light, ids of nodes have the colors of sheets, each object has its own.
+    """Return a layer in colors: near is light, ids of nodes have the colors of sheets, each object has its own.
 
     What few images have seen is dark.
 
@@ -210,7 +210,7 @@ def _by_distance(millimeters: Values) -> Picture:
 def layer_pictures(
     stored: StoredScene, path: CameraPath, layers: Sequence[str], returns: LidarReturns | None = None
 ) -> Iterator[Picture]:
-    """Yields one picture an instant: a row of cameras for each layer, one below the other."""
+    """Yield one picture an instant: a row of cameras for each layer, one below the other."""
     nodes, wanted = list(stored.scene.nodes), dict.fromkeys((*layers, "rgb") if "lidar" in layers else layers)
     for rig in path:
         views = [layer_values(stored, view, tuple(wanted), returns) for view in rig]
@@ -228,7 +228,7 @@ def write_layers(
     shown: Iterator[int] | range,
     returns: LidarReturns | None = None,
 ) -> int:
-    """Writes a folder of PNGs for each layer, the exact values, and tables of ids; whole or not at all.
+    """Write a folder of PNGs for each layer, the exact values, and tables of ids; whole or not at all.
 
     Each camera of a rig has its own folder below if there are several. Returns the number of instants. ``shown`` runs
     over the instants. Raises OSError if the folder is not empty or cannot be written.
@@ -250,7 +250,7 @@ def write_layers(
 
 
 def tables(stored: StoredScene, layers: Sequence[str]) -> Mapping[str, Any]:
-    """Returns what ids mean, for the layers that have some."""
+    """Return what ids mean, for the layers that have some."""
     found: dict[str, Any] = {}
     if "nodes" in layers:
         found["nodes"] = {str(number): name for number, name in enumerate(stored.scene.nodes, start=1)}
@@ -290,7 +290,7 @@ def _instance_ids(stored: StoredScene, rendering: SceneRendering) -> Int[Tensor,
 def _shown_ids(
     stored: StoredScene, view: View, rendering: SceneRendering, ids: Int[Tensor, " n"]
 ) -> Int[np.ndarray, "h w"]:
-    """Returns the id with the largest weight at each pixel, out of those in view; the rest of the light has id 0."""
+    """Return the id with the largest weight at each pixel, out of those in view; the rest of the light has id 0."""
     known = [number for number in ids[rendering.splats.visible].unique().tolist() if number > 0]
     seen = stored.scene.seen(view)
     weights = []
@@ -309,6 +309,6 @@ def _shown_ids(
 def _splatted(
     stored: StoredScene, seen: View, rendering: SceneRendering, share: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "h w 3"]:
-    """Returns the sum over the Gaussians of their weight at a pixel times their share: colors without harmonics."""
+    """Return the sum over the Gaussians of their weight at a pixel times their share: colors without harmonics."""
     labeled = replace(rendering.gaussians, sh=((share - 0.5) / _FIRST_HARMONIC)[:, None])
     return splat(labeled, seen.camera, settings=stored.options.settings, backend=stored.options.backend).rgb

@@ -119,7 +119,7 @@ POSES = "poses.json"
 
 @torch.no_grad()
 def write_objects(folder: Path, stored: StoredScene, views: Sequence[View]) -> list[str]:
-    """Writes a .ply for each object and one for all that stands still, and ``poses.json``; returns the objects' names.
+    """Write a .ply for each object and one for all that stands still, and ``poses.json``; return the objects' names.
 
     An object that no recorded instant shows is left out.
 
@@ -157,7 +157,7 @@ def _instants(views: Sequence[View]) -> list[View]:
 def _object(
     folder: Path, stored: StoredScene, node_name: str, node: Tracked, number: int, instants: Sequence[View], place: int
 ) -> list[dict[str, Any]]:
-    """Writes an object, and returns what is said of it; nothing of one that is never there."""
+    """Write an object, and return what is said of it; nothing of one that is never there."""
     frames = [(view, node.pose_at(view.time)) for view in instants]
     there = [(view, node.object_frames(poses)[number]) for view, poses in frames if bool(poses.present[number])]
     if not there:

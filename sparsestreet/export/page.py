@@ -40,7 +40,7 @@ _LOOK = 10.0
 def write_page(
     path: Path | str, parts: Sequence[Part], seconds: Sequence[float], start: View, *, dome: Cloud | None, title: str
 ) -> None:
-    """Writes the page, the whole file or nothing.
+    """Write the page, the whole file or nothing.
 
     Args:
         path: the file.
@@ -66,7 +66,7 @@ def write_page(
 
 
 def viser_module() -> ModuleType:
-    """Returns viser. Raises ImportError, saying how to get it, where it is not installed."""
+    """Return viser. Raises ImportError, saying how to get it, where it is not installed."""
     try:
         import viser
     except ModuleNotFoundError as error:

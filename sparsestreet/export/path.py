@@ -23,7 +23,7 @@ _SAME = 1e-3
 
 
 def recorded(views: Sequence[View]) -> CameraPath:
-    """Returns the views as they were recorded. Raises ValueError without views.
+    """Return the views as they were recorded. Raises ValueError without views.
 
     >>> camera = Camera(torch.eye(4), torch.eye(3), width=8, height=6)
     >>> path = recorded([View(camera, 1.0, 1, 0), View(camera, 0.0, 0, 0)])
@@ -39,7 +39,7 @@ def recorded(views: Sequence[View]) -> CameraPath:
 
 
 def of_frames(path: CameraPath, frames: slice) -> CameraPath:
-    """Returns the instants whose frame index lies in start:stop. Raises ValueError if there is none."""
+    """Return the instants whose frame index lies in start:stop. Raises ValueError if there is none."""
     indices = [rig[0].frame_index for rig in path]
     start = 0 if frames.start is None else frames.start
     stop = math.inf if frames.stop is None else frames.stop
@@ -50,12 +50,12 @@ def of_frames(path: CameraPath, frames: slice) -> CameraPath:
 
 
 def of_cameras(path: CameraPath, cameras: Sequence[int]) -> CameraPath:
-    """Returns only these cameras, in the given order. Raises ValueError for a camera that any instant lacks."""
+    """Return only these cameras, in the given order. Raises ValueError for a camera that any instant lacks."""
     return tuple(tuple(_view_of(rig, index) for index in cameras) for rig in path)
 
 
 def left_to_right(rig: Rig) -> list[int]:
-    """Returns camera indices, leftmost first, by the yaw of their optical axes relative to the rig's first camera.
+    """Return camera indices, leftmost first, by the yaw of their optical axes relative to the rig's first camera.
 
     >>> camera = Camera(torch.eye(4), torch.eye(3), width=8, height=6)
     >>> left_to_right((View(camera, 0.0, 0, 0), View(camera, 0.0, 0, 1)))
@@ -64,7 +64,7 @@ def left_to_right(rig: Rig) -> list[int]:
     front_from_world = rig[0].camera.camera_from_world[:3, :3].double()
 
     def yaw(view: View) -> float:
-        """Returns the angle to the right of the first camera, radians; row 3 of camera_from_world is the world axis."""
+        """Return the angle to the right of the first camera, radians; row 3 of camera_from_world is the world axis."""
         x, _, z = (front_from_world @ view.camera.camera_from_world[2, :3].double()).tolist()
         return round(math.atan2(x, z), 6)
 
@@ -72,7 +72,7 @@ def left_to_right(rig: Rig) -> list[int]:
 
 
 def shifted(path: CameraPath, offset: float, *, gradually: bool = False) -> CameraPath:
-    """Returns every rig moved sideways as one, ``offset`` meters to the right of its camera with the lowest index.
+    """Return every rig moved sideways as one, ``offset`` meters to the right of its camera with the lowest index.
 
     ``gradually``: as in a change of lane, from nothing at the first instant to all at the last, 3 s^2 - 2 s^3 of it at
     fraction s of the time between. The views keep time and camera index. They lose their frame index, because nobody
@@ -99,7 +99,7 @@ def shifted(path: CameraPath, offset: float, *, gradually: bool = False) -> Came
 
 
 def resampled(path: CameraPath, step: float) -> CameraPath:
-    """Returns an instant every ``step`` of normalized time from the first to the last.
+    """Return an instant every ``step`` of normalized time from the first to the last.
 
     Positions are interpolated linearly, rotations by slerp. An instant that coincides with one of the path is that one;
     the others have no frame index. Raises ValueError for a step that is not above 0.
@@ -117,7 +117,7 @@ def resampled(path: CameraPath, step: float) -> CameraPath:
 
 
 def resized(path: CameraPath, width: int) -> CameraPath:
-    """Returns all cameras with images ``width`` pixels wide, the height in proportion.
+    """Return all cameras with images ``width`` pixels wide, the height in proportion.
 
     >>> path = recorded([View(Camera(torch.eye(4), torch.eye(3), width=8, height=6), 0.0, 0, 0)])
     >>> resized(path, 4)[0][0].camera.height
@@ -145,7 +145,7 @@ def _view_of(rig: Rig, camera: int) -> View:
 
 
 def bare(view: View) -> View:
-    """Returns the view without a Frame's pixels, which belong to its recorded pose."""
+    """Return the view without a Frame's pixels, which belong to its recorded pose."""
     return View(view.camera, view.time, view.frame_index, view.camera_index, view.seconds, view.stamp)
 
 
@@ -185,14 +185,14 @@ def _between(a: View, b: View, fraction: float) -> View:
 
 
 def raised(path: CameraPath, meters: float) -> CameraPath:
-    """Returns every camera moved up in the world; the views lose their frame index, as nobody recorded them."""
+    """Return every camera moved up in the world; the views lose their frame index, as nobody recorded them."""
     vector = torch.tensor([0.0, 0.0, meters], dtype=torch.float64)
     rigs = [[replace(bare(view), camera=moved(view.camera, vector), frame_index=None) for view in rig] for rig in path]
     return tuple(tuple(rig) for rig in rigs)
 
 
 def cropped(path: CameraPath, height: int) -> CameraPath:
-    """Returns images so many pixels high: as many rows come or go above as below, and nothing is scaled."""
+    """Return images so many pixels high: as many rows come or go above as below, and nothing is scaled."""
 
     def change(camera: Camera) -> Camera:
         matrix = camera.intrinsics.clone()
@@ -203,7 +203,7 @@ def cropped(path: CameraPath, height: int) -> CameraPath:
 
 
 def pinholes(path: CameraPath, fov: float) -> CameraPath:
-    """Returns pinholes of a horizontal field of view, degrees, with square pixels and their axis in the middle.
+    """Return pinholes of a horizontal field of view, degrees, with square pixels and their axis in the middle.
 
     Raises ValueError for a field of view that no pinhole has.
     """
@@ -220,7 +220,7 @@ def pinholes(path: CameraPath, fov: float) -> CameraPath:
 
 
 def intrinsics(fx: float, fy: float, cx: float, cy: float) -> torch.Tensor:
-    """Returns the matrix of a pinhole, pixels.
+    """Return the matrix of a pinhole, pixels.
 
     >>> intrinsics(2.0, 3.0, 4.0, 5.0).tolist()
     [[2.0, 0.0, 4.0], [0.0, 3.0, 5.0], [0.0, 0.0, 1.0]]

@@ -37,7 +37,7 @@ _MIN_SCALE = 1e-30
 
 
 def write_ply(path: Path | str, gaussians: Gaussians, *, antialiased: bool = False) -> int:
-    """Writes the Gaussians whose opacity is above 0 and returns their number; writes the whole file or nothing.
+    """Write the Gaussians whose opacity is above 0 and return their number; write the whole file or nothing.
 
     Binary, little endian, float32, one vertex a Gaussian: x y z, nx ny nz (zeros), f_dc_0..2, f_rest_* (all of red,
     then green, then blue), opacity (logit), scale_0..2 (log of meters), rot_0..3 (unit, wxyz). ``antialiased`` is said
@@ -71,7 +71,7 @@ def scene_gaussians(
     nodes: Collection[str] | None = None,
     instances: Collection[str] | None = None,
 ) -> Gaussians:
-    """Returns all or some of the scene's Gaussians in the world frame at a time in [0, 1].
+    """Return all or some of the scene's Gaussians in the world frame at a time in [0, 1].
 
     Args:
         stored: an opened scene file.
@@ -99,7 +99,7 @@ def scene_gaussians(
 
 
 def instance_names(stored: StoredScene) -> list[str]:
-    """Returns the names of the tracks whose Gaussians can be exported alone."""
+    """Return the names of the tracks whose Gaussians can be exported alone."""
     objects = [node.instances() for node in stored.scene.nodes.values()]
     return [name for some in objects if some is not None for name in some.names]
 
@@ -132,7 +132,7 @@ def _rows_of_instances(
 
 
 def _presence(stored: StoredScene, node: Node, objects: Instances, name: str) -> str:
-    """Says between which times an object's Gaussians have an opacity: of even frames, and of the ends of its span."""
+    """Say between which times an object's Gaussians have an opacity: of even frames, and of the ends of its span."""
     steps, place = min(max(stored.num_frames - 1, 1), _TOLD_APART), objects.names.index(name)
     rows = objects.ids == place
     ends = [] if objects.spans is None else objects.spans[place].tolist()
@@ -153,7 +153,7 @@ def _known(kind: str, names: Collection[str], known: Collection[str]) -> None:
 
 
 def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
-    """Returns one row a vertex, its properties in the order of the header, little endian."""
+    """Return one row a vertex, its properties in the order of the header, little endian."""
     keep = gaussians.opacities > 0
     values = {name: getattr(gaussians, name).detach()[keep].cpu() for name in _FIELDS}
     opacities = values["opacities"].double().clamp(max=_MAX_OPACITY)

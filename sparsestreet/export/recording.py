@@ -67,7 +67,7 @@ class Part:
 
 @torch.no_grad()
 def recorded_parts(stored: StoredScene, path: CameraPath, every: int) -> list[Part]:
-    """Returns the parts of a scene at the instants of a path; one that is never there is left out.
+    """Return the parts of a scene at the instants of a path; one that is never there is left out.
 
     What changes its shape (bodies, networks, masks over time) gets a shape every so many instants, as it is at that
     instant. A field is deformed where the first camera of the instant sees it.
@@ -145,7 +145,7 @@ def _part(
 
 
 def _cloud(whole: _Whole, rows: Tensor | slice, smallest: float) -> Cloud:
-    """Returns the rows whose opacity is not below what is ever drawn."""
+    """Return the rows whose opacity is not below what is ever drawn."""
     own = whole.gaussians
     kept = own.opacities[rows] >= smallest
     axes = quat.to_matrix(quat.normalized(own.quaternions[rows][kept])) * own.scales[rows][kept][:, None, :]
@@ -170,7 +170,7 @@ def _same_shape(one: RawGaussians, other: RawGaussians) -> bool:
 
 
 def _seen_colors(looks: Sequence[tuple[RawGaussians, Rig]]) -> Float[Tensor, "n 3"]:
-    """Returns the mean color of each row as the cameras see it; that of its first harmonic where none does."""
+    """Return the mean color of each row as the cameras see it; that of its first harmonic where none does."""
     first = looks[0][0].sh_dc[:, 0]
     total, weight = torch.zeros_like(first), torch.zeros_like(first[:, :1])
     for raw, rig in looks:

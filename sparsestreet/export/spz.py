@@ -45,7 +45,7 @@ _HALF = np.sqrt(0.5)
 
 
 def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) -> int:
-    """Writes Gaussians with x right, y down, z ahead; returns their number; the whole file or nothing.
+    """Write Gaussians with x right, y down, z ahead; return their number; the whole file or nothing.
 
     Rounding: positions 2**-13 m within 2,048 m (twice that for each time it is twice as far), log scales 1 / 32 in
     [-10, 5.9], opacities 1 / 510, parts of quaternions 0.0007, the first harmonic 1 / 77 in [-3.3, 3.3], the others
@@ -92,7 +92,7 @@ def spz_notes(gaussians: Gaussians) -> list[str]:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Returns the Gaussians of such a file, x right, y down, z ahead. Raises ValueError for one that is none."""
+    """Return the Gaussians of such a file, x right, y down, z ahead. Raises ValueError for one that is none."""
     # Above what the largest file unpacks to, zlib stops.
     with gzip.open(path) as stream:
         try:
@@ -125,7 +125,7 @@ def read_spz(path: Path) -> Gaussians:
 
 
 def _fraction_bits(reach: float) -> int:
-    """Returns how many bits stand behind the point: fewer where 24 bits do not reach as far."""
+    """Return how many bits stand behind the point: fewer where 24 bits do not reach as far."""
     bits = _FRACTION_BITS
     while bits and reach * 2**bits >= 2**23 - 1:
         bits -= 1
@@ -139,7 +139,7 @@ def _bytes(values: Float[np.ndarray, "..."]) -> UInt8[np.ndarray, "..."]:
 
 
 def _smallest_three(unit: Float[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
-    """Returns 32 bits a quaternion: two for the place of the largest part among x, y, z, w, and ten for each other."""
+    """Return 32 bits a quaternion: two for the place of the largest part among x, y, z, w, and ten for each other."""
     xyzw = unit[:, [1, 2, 3, 0]]
     largest = np.abs(xyzw).argmax(1)
     xyzw = np.where(np.take_along_axis(xyzw, largest[:, None], 1) < 0, -xyzw, xyzw)
@@ -194,7 +194,7 @@ def check_file(
     own_reader: Callable[[Path], Gaussians],
     settings: SplatSettings,
 ) -> Checked:
-    """Reads a file by another program where it is installed, else by our own reader, and renders both.
+    """Read a file by another program where it is installed, else by our own reader, and render both.
 
     ``written`` has the axes of viewers, ``camera`` too. Raises ValueError where the file cannot be read or has another
     number of Gaussians.
@@ -209,14 +209,14 @@ def check_file(
 
 
 def turned_camera(camera: Camera, new_from_world: torch.Tensor) -> Camera:
-    """Returns the same camera in turned axes, as a pinhole without a shutter."""
+    """Return the same camera in turned axes, as a pinhole without a shutter."""
     turn = torch.eye(4, dtype=camera.camera_from_world.dtype)
     turn[:3, :3] = new_from_world
     return Camera(camera.camera_from_world @ inverse(turn), camera.intrinsics, camera.width, camera.height)
 
 
 def read_plain_ply(path: Path) -> Gaussians:
-    """Returns the Gaussians of a .ply in the layout of 3DGS, binary, of floats alone. Raises ValueError for another."""
+    """Return the Gaussians of a .ply in the layout of 3DGS, binary, of floats alone. Raises ValueError for another."""
     content = path.read_bytes()
     head, _, body = content.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]

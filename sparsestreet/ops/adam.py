@@ -90,7 +90,7 @@ def adam_step_(
     *,
     backend: str = "auto",
 ) -> None:
-    """Updates ``parameter`` and both moments of ``visible`` rows by Adam; other rows keep every bit.
+    """Update ``parameter`` and both moments of ``visible`` rows by Adam; other rows keep every bit.
 
     With all rows visible it is torch.optim.Adam without weight decay. ``backend``: "torch", "triton", or "auto" for
     the one that suits the tensors. Raises as :func:`sparsestreet.ops.backend.fused_backend` does, and ValueError for
@@ -116,7 +116,7 @@ def adam_step_(
 
 
 def check_shapes(*tensors: Tensor) -> None:
-    """Raises ValueError unless a parameter, its gradient and both moments have one shape."""
+    """Raise ValueError unless a parameter, its gradient and both moments have one shape."""
     shapes = [tuple(tensor.shape) for tensor in tensors]
     if len(set(shapes)) != 1:
         raise ValueError(f"parameter, gradient and moments must have one shape, got {shapes}: resize them together")
@@ -138,7 +138,7 @@ def adam_rows_(
     width: int,
     backend: str = "auto",
 ) -> None:
-    """Updates ``parameter`` and both moments by Adam; rows whose gradient is not finite keep every bit.
+    """Update ``parameter`` and both moments by Adam; rows whose gradient is not finite keep every bit.
 
     Where all are finite it is torch.optim.Adam without weight decay. On processors with fused multiplication "cpu" has
     the bits of its ``fused`` form. Nothing waits for a device, but for "torch" on a GPU.

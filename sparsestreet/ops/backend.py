@@ -16,7 +16,7 @@ TRITON_REMEDY = "pip install 'sparsestreet[gpu]' (Linux)"
 
 
 def resolve_backend(name: str, device: torch.device) -> str:
-    """Returns ``name`` if it can run on ``device``, or for "auto" the fastest backend that can.
+    """Return ``name`` if it can run on ``device``, or for "auto" the fastest backend that can.
 
     "auto" takes "triton" on CUDA devices and "cpu" on the CPU; if they are missing, it takes "reference" and warns
     once.
@@ -81,7 +81,7 @@ CHOICES = ("torch", "cpu", "triton")
 
 
 def fused_backend(backend: str, *tensors: Tensor, choices: tuple[str, ...] = CHOICES) -> str:
-    """Returns which of ``choices`` runs a step on these tensors, all on one device; for "auto" the fastest.
+    """Return which of ``choices`` runs a step on these tensors, all on one device; for "auto" the fastest.
 
     The C++ library ("cpu") takes tensors on the CPU that are all float32 or all float64. "triton" takes contiguous
     float32 tensors on a CUDA device; if it is named, also on the CPU, by Triton's interpreter. Results differ only by
@@ -147,7 +147,7 @@ Result = TypeVar("Result")
 
 
 def disable_compile(op: Callable[P, Result]) -> Callable[P, Result]:
-    """Returns ``op``, which a compiled function then calls uncompiled: the graph breaks there.
+    """Return ``op``, which a compiled function then calls uncompiled: the graph breaks there.
 
     Dynamo would otherwise trace into the choice of the backend and the library's pointers, and warn. The function
     ``torch.compiler.disable`` does the same, but imports the compiler at once, which takes as long as torch itself.

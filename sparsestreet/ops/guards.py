@@ -86,7 +86,7 @@ def guards(
     *,
     settings: SplatSettings = SplatSettings(),  # noqa: B008 (frozen)
 ) -> Guards:
-    """Counts what :func:`splat` with the same arguments culls and limits, on any device.
+    """Count what :func:`splat` with the same arguments culls and limits, on any device.
 
     It projects anew, as the reference does, in the dtype of the Gaussians. Where rounding decides about a row, another
     backend may decide otherwise. :func:`splat` itself does not count, so it pays nothing.

@@ -21,7 +21,7 @@ class PairLimitError(DemandError):
 
     @staticmethod
     def of(pairs: int, limit: int, worst: list[tuple[int, int]]) -> "PairLimitError":
-        """Returns the error for ``pairs`` above ``limit``; ``worst``: the rows with most tiles, and their numbers."""
+        """Return the error for ``pairs`` above ``limit``; ``worst``: the rows with most tiles, and their numbers."""
         named = ", ".join(f"row {row} ({tiles})" for row, tiles in worst)
         return PairLimitError(
             f"the splats cover {pairs} tiles, more than the {limit} that may be held; most: {named}. "

@@ -62,7 +62,7 @@ class SplatSettings:
 
     @staticmethod
     def preset(name: str) -> "SplatSettings":
-        """Returns settings by name; raises ValueError with the names of all presets.
+        """Return settings by name; raise ValueError with the names of all presets.
 
         ``gsplat15``, ``gsplat16``, ``inria`` and ``drivestudio`` match those renderers as far as these fields allow.
         """

@@ -27,7 +27,7 @@ def over_sky(
     transmittance_min: float,
     backend: str = "auto",
 ) -> Float[Tensor, "h w 3"]:
-    """Adds the sky's color times the light 1 - alpha to ``rgb``, where that light is above ``transmittance_min``.
+    """Add the sky's color times the light 1 - alpha to ``rgb``, where that light is above ``transmittance_min``.
 
     Differentiable in ``rgb``, ``alpha`` and ``texels``, not in the camera. The sky is at infinity. A pixel sees it
     along its ray through the lens (``ray_directions``); the rolling shutter is ignored.

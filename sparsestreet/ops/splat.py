@@ -90,7 +90,7 @@ def contribution(
     settings: SplatSettings = DEFAULT_SETTINGS,
     backend: str = "auto",
 ) -> Contribution:
-    """Computes what each row adds to one view: sum of blend weights, pixels touched, pixels dominated. No gradients.
+    """Compute what each row adds to one view: sum of blend weights, pixels touched, pixels dominated. No gradients.
 
     Raises as :func:`splat` does.
 
@@ -118,7 +118,7 @@ def leave_one_out(
     settings: SplatSettings = DEFAULT_SETTINGS,
     backend: str = "auto",
 ) -> LeaveOneOut:
-    """Computes how much the view changes when each row alone is removed, over a background (None: black). No gradients.
+    """Compute how much the view changes when each row alone is removed, over a background (None: black). No gradients.
 
     ``pixel_weights``, finite and >= 0, multiply the squared change of each pixel; None: 1.
 
@@ -170,7 +170,7 @@ def _zero(dtype: torch.dtype, device: torch.device) -> Float[Tensor, ""]:
 
 
 def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rendering:
-    """Adds the background and turns the sum of depths into an expectation."""
+    """Add the background and turn the sum of depths into an expectation."""
     alpha = 1 - raster.transmittance
     rgb = raster.rgb
     if background is not None:

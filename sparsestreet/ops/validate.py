@@ -29,7 +29,7 @@ _SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": (), 
 
 
 def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | None) -> None:
-    """Checks shapes, dtypes, devices, the camera and a background on the host; raises ValueError.
+    """Check shapes, dtypes, devices, the camera and a background on the host; raise ValueError.
 
     It reads neither values of Gaussians nor anything on a GPU, so it is cheap and never waits.
     """
@@ -63,7 +63,7 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
 
 
 def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
-    """Checks for one finite weight >= 0 per pixel, of the means' dtype and device; raises ValueError. Waits for a
+    """Check for one finite weight >= 0 per pixel, of the means' dtype and device; raise ValueError. Waits for a
     GPU."""
     shape = (camera.height, camera.width)
     if tuple(weights.shape) != shape or weights.dtype != means.dtype or weights.device != means.device:
@@ -76,7 +76,7 @@ def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
 
 
 def check_gates(gates: Tensor, means: Tensor) -> None:
-    """Checks for one gate in [0, 1] per row, of the means' dtype and device; raises ValueError.
+    """Check for one gate in [0, 1] per row, of the means' dtype and device; raise ValueError.
 
     As those of a background, values on a GPU are not checked, which would wait for it."""
     if gates.shape != means.shape[:1] or gates.dtype != means.dtype or gates.device != means.device:
@@ -91,7 +91,7 @@ def check_gates(gates: Tensor, means: Tensor) -> None:
 
 
 def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) -> None:
-    """Checks that values are finite, opacities in [0, 1], scales >= 0; raises ValueError naming field, row and value.
+    """Check that values are finite, opacities in [0, 1], scales >= 0; raise ValueError naming field, row and value.
 
     Rows of opacity 0 are not checked, because they are culled before anything else of them is read. ``drawn``: the rows
     whose harmonics are checked; None: those of all rows, for when a bad one is known to exist.
@@ -135,7 +135,7 @@ def _check_size(camera: Camera) -> None:
 
 
 def check_camera(camera: Camera) -> None:
-    """Checks a camera's size, pose, intrinsics and effects; raises ValueError.
+    """Check a camera's size, pose, intrinsics and effects; raise ValueError.
 
     Numbers that were found good are not checked again. NaN equals nothing, so it never was."""
     _check_size(camera)

@@ -53,7 +53,7 @@ class Picture:
 
 
 def color_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
-    """Returns colors from black through red to pale yellow for values in [0, 1]; others are clipped.
+    """Return colors from black through red to pale yellow for values in [0, 1]; others are clipped.
 
     >>> color_map(np.array([0.0, 1.0])).tolist()
     [[0, 0, 4], [252, 255, 164]]
@@ -67,7 +67,7 @@ def color_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 
 def error_picture(
     render: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], scale: float = ERROR_SCALE
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the mean absolute difference over RGB in [0, 1], divided by ``scale`` and colored.
+    """Return the mean absolute difference over RGB in [0, 1], divided by ``scale`` and colored.
 
     >>> black, white = np.zeros((1, 2, 3), np.uint8), np.full((1, 2, 3), 255, np.uint8)
     >>> error_picture(black, white)[0, 0].tolist()
@@ -80,7 +80,7 @@ def error_picture(
 def draw_lidar_end(
     picture: UInt8[np.ndarray, "h w 3"], near: Bool[np.ndarray, "h w"], beyond: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns the picture with a line on the near pixels that touch a pixel beyond.
+    """Return the picture with a line on the near pixels that touch a pixel beyond.
 
     The line is one pixel wide. It is wider in images above 720 pixels, so that a sheet's tile still shows it.
     """
@@ -90,13 +90,13 @@ def draw_lidar_end(
 
 
 def write_png(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Writes an RGB image and creates its folder."""
+    """Write an RGB image and creates its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(path)
 
 
 def picture_path(folder: Path, frame: int, camera: int, kind: str) -> Path:
-    """Returns the path of one image of a picture; ``kind`` is one of ``KINDS``.
+    """Return the path of one image of a picture; ``kind`` is one of ``KINDS``.
 
     >>> picture_path(Path("pictures"), frame=7, camera=0, kind="render").name
     '007_0_render.png'
@@ -105,19 +105,19 @@ def picture_path(folder: Path, frame: int, camera: int, kind: str) -> Path:
 
 
 def write_picture(folder: Path, picture: Picture) -> None:
-    """Writes truth, render, error and centers as single PNGs in their own resolution."""
+    """Write truth, render, error and centers as single PNGs in their own resolution."""
     for kind in KINDS:
         write_png(picture_path(folder, picture.frame, picture.camera, kind), getattr(picture, kind))
 
 
 def drawn_views(folder: Path) -> list[tuple[int, int]]:
-    """Returns frame and camera of each picture in a folder, in order."""
+    """Return frame and camera of each picture in a folder, in order."""
     stems = (path.stem.split("_") for path in folder.glob("*_truth.png"))
     return sorted((int(frame), int(camera)) for frame, camera, _ in stems)
 
 
 def read_pictures(folder: Path) -> list[Picture]:
-    """Returns the pictures in a folder in order of frame and camera.
+    """Return the pictures in a folder in order of frame and camera.
 
     Raises FileNotFoundError if there are none, or if a picture lacks one of its images.
     """

@@ -31,7 +31,7 @@ def plot_counts(
     events: Sequence[tuple[int, str]] = (),
     title: str = "Gaussians per node",
 ) -> None:
-    """Draws the number of Gaussians of each node over training steps and marks events.
+    """Draw the number of Gaussians of each node over training steps and marks events.
 
     Args:
         path: PNG to write.
@@ -67,7 +67,7 @@ def plot_psnr(
     title: str = "PSNR over training",
     along: str = "step",
 ) -> None:
-    """Draws PSNR in dB over training steps, one curve per name -> (steps, PSNR), and marks (step, name) events.
+    """Draw PSNR in dB over training steps, one curve per name -> (steps, PSNR), and marks (step, name) events.
 
     ``along`` names the horizontal axis.
     """
@@ -81,7 +81,7 @@ def plot_psnr(
 def plot_runs(
     path: Path, points: Mapping[str, Sequence[tuple[int, float]]], title: str = "Quality against size"
 ) -> None:
-    """Draws every run as a point; ``points``: name of a variant -> (Gaussians, held-out PSNR in dB) of its runs."""
+    """Draw every run as a point; ``points``: name of a variant -> (Gaussians, held-out PSNR in dB) of its runs."""
     figure, axes = _figure(title, "Gaussians", "held-out PSNR, full image (dB)")
     for index, (name, runs) in enumerate(points.items()):
         gaussians, psnr = zip(*runs, strict=True)
@@ -114,7 +114,7 @@ def _figure(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 
 def _mark(axes: Axes, events: Sequence[tuple[int, str]]) -> None:
-    """Draws a vertical line at each event; events of one name share a style and an entry of the legend."""
+    """Draw a vertical line at each event; events of one name share a style and an entry of the legend."""
     names = list(dict.fromkeys(name for _, name in events))
     style = {name: {"color": "0.55", "linewidth": 0.8, "linestyle": _DASHES[i % 3]} for i, name in enumerate(names)}
     for step, name in events:
@@ -156,7 +156,7 @@ HELD_OUT_COLUMNS = {"full image": "psnr_full", "humans": "psnr_human", "vehicles
 
 
 def draw_history(run: Path) -> None:
-    """Writes ``counts.png``, ``psnr.png`` and ``held_out.png`` to the run's folder ``curves``.
+    """Write ``counts.png``, ``psnr.png`` and ``held_out.png`` to the run's folder ``curves``.
 
     They show ``records/counts.csv``, ``curves/metrics.csv`` and ``curves/held_out.csv``. A run without one of these
     files gets no picture of it. Raises RecordError for a malformed file.
@@ -177,7 +177,7 @@ def draw_history(run: Path) -> None:
 
 
 def _to_the_end(steps: list[int], counts: dict[str, list[int]], run: Path) -> tuple[list[int], dict[str, list[int]]]:
-    """Returns the curves with the run's last step, at which nothing need have changed."""
+    """Return the curves with the run's last step, at which nothing need have changed."""
     known = RUN.find(run)
     if known is None or not steps or known.steps <= steps[-1]:
         return steps, counts
@@ -185,7 +185,7 @@ def _to_the_end(steps: list[int], counts: dict[str, list[int]], run: Path) -> tu
 
 
 def count_curves(changes: Sequence[CountChange]) -> tuple[list[int], dict[str, list[int]]]:
-    """Returns the steps at which any node changes, and node -> its number of Gaussians after each of these steps.
+    """Return the steps at which any node changes, and node -> its number of Gaussians after each of these steps.
 
     >>> count_curves([CountChange(0, "road", 0, 9, "start"), CountChange(5, "cars", 0, 4, "start")])
     ([0, 5], {'road': [9, 9], 'cars': [0, 4]})
@@ -203,7 +203,7 @@ def count_curves(changes: Sequence[CountChange]) -> tuple[list[int], dict[str, l
 
 
 def marks(changes: Sequence[CountChange]) -> list[tuple[int, str]]:
-    """Returns (step, reason) of the changes that make the scene small, each once, in order.
+    """Return (step, reason) of the changes that make the scene small, each once, in order.
 
     >>> marks([CountChange(0, "road", 0, 9, "start"), CountChange(8, "road", 9, 6, PRUNING)])
     [(8, 'pruning')]
@@ -214,7 +214,7 @@ def marks(changes: Sequence[CountChange]) -> list[tuple[int, str]]:
 def psnr_curves(
     rows: Sequence[Mapping[str, Any]], columns: Mapping[str, str], along: str
 ) -> dict[str, tuple[Sequence[int | float], Sequence[float]]]:
-    """Returns name of a curve -> (steps or seconds, dB), from the rows that have a value.
+    """Return name of a curve -> (steps or seconds, dB), from the rows that have a value.
 
     >>> psnr_curves([{"step": 1.0, "psnr": 20.5}, {"step": 2.0, "psnr": None}], {"training": "psnr"}, "step")
     {'training': ((1.0,), (20.5,))}
@@ -232,7 +232,7 @@ _MARK = np.array([230.0, 40.0, 40.0])
 
 
 def draw_evidence(path: Path, title: str, panels: Sequence[Panel]) -> None:
-    """Writes a PNG with a cell for each panel. Raises ValueError without any."""
+    """Write a PNG with a cell for each panel. Raises ValueError without any."""
     if not panels:
         raise ValueError("a picture of evidence needs a panel, and no effect has one")
     lines = -(-len(panels) // COLUMNS)

@@ -49,7 +49,7 @@ class Tile:
 def picture_sheet(
     pictures: Sequence[Picture], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """Returns a sheet with one line per picture and the columns truth, render, error, centers.
+    """Return a sheet with one line per picture and the columns truth, render, error, centers.
 
     Args:
         pictures: at least one.
@@ -71,7 +71,7 @@ def picture_sheet(
 def comparison_sheet(
     columns: Sequence[SheetColumn], *, title: str, legend: Legend | None = None, tile_width: int = TILE_WIDTH
 ) -> UInt8[np.ndarray, "sheet_h sheet_w 3"]:
-    """Returns a sheet that compares runs on the same images, one column each.
+    """Return a sheet that compares runs on the same images, one column each.
 
     Every picture has a line of renders next to the truth, a line of errors and a line of centers. Raises ValueError for
     fewer than two runs, or if they show different images.
@@ -104,7 +104,7 @@ def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def tile_sheet(tiles: Sequence[Tile], *, title: str, columns: int, tile_width: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns a sheet of tiles in lines of so many, under a title."""
+    """Return a sheet of tiles in lines of so many, under a title."""
     lines: list[list[Tile | None]] = [list(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
     return np.asarray(_laid_out(lines, title, tile_width, foot=0)[0])
 
@@ -141,7 +141,7 @@ def _laid_out(lines: list[list[Tile | None]], title: str, tile_width: int, foot:
 
 
 def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int, lidar_end: bool) -> None:
-    """Draws the error colors with their values, and the meaning of the line at the lidar's end."""
+    """Draw the error colors with their values, and the meaning of the line at the lidar's end."""
     x = _write(draw, (x, y), "error: |render - truth|, mean over RGB, values in [0, 1]:   0", _QUIET, 13) + 8
     bar = color_map(np.broadcast_to(np.linspace(0, 1, 160), (16, 160)).copy())
     paper.paste(Image.fromarray(bar), (x, y))
@@ -153,7 +153,7 @@ def _draw_scale(paper: Image.Image, draw: ImageDraw.ImageDraw, x: int, y: int, l
 
 
 def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> None:
-    """Writes the names of the nodes in the colors of their centers."""
+    """Write the names of the nodes in the colors of their centers."""
     if legend:
         x = _write(draw, (x, y), "centers:", _QUIET, 13) + 12
     for name, color in legend.items():
@@ -162,7 +162,7 @@ def _draw_legend(draw: ImageDraw.ImageDraw, legend: Legend, x: int, y: int) -> N
 
 
 def _fitted(image: UInt8[np.ndarray, "h w 3"], width: int) -> Image.Image:
-    """Returns the image scaled to the tile's width; small images keep hard pixels, so scaling adds no blur."""
+    """Return the image scaled to the tile's width; small images keep hard pixels, so scaling adds no blur."""
     height = max(round(image.shape[0] * width / image.shape[1]), 1)
     filter_ = Image.Resampling.LANCZOS if width < image.shape[1] else Image.Resampling.NEAREST
     return Image.fromarray(image).resize((width, height), filter_)
@@ -176,7 +176,7 @@ def _write(
     size: int,
     room: int | None = None,
 ) -> int:
-    """Writes a line and returns where it ends; if ``room`` is short, the type shrinks (not below 8 pixels)."""
+    """Write a line and return where it ends; if ``room`` is short, the type shrinks (not below 8 pixels)."""
     while room is not None and size > 8 and draw.textlength(text, font=_font(size)) > room:
         size -= 1
     draw.text(position, text, fill=color, font=_font(size))
@@ -192,7 +192,7 @@ _GAINS = (("full", "full image", "#3465a4"), ("vehicle", "vehicles", "#e07b00"),
 
 
 def draw_effects(run: Path) -> None:
-    """Writes ``pictures/effects.png``: a row for each effect of the plan, its milliseconds and its gain.
+    """Write ``pictures/effects.png``: a row for each effect of the plan, its milliseconds and its gain.
 
     A run without a plan or without measured costs gets no picture. Raises RecordError for a malformed record.
     """

@@ -48,7 +48,7 @@ class Importance:
         self._total: Float64[Tensor, " n"] | None = None
 
     def add(self, contribution: Contribution) -> None:
-        """Adds one view.
+        """Add one view.
 
         Raises ValueError if the view has another number of rows than the views before, or a weight that is NaN,
         infinite or negative.
@@ -73,7 +73,7 @@ class Importance:
         self.views += 1
 
     def scores(self, ranks: Ranks = ALONE) -> Float64[Tensor, " n"]:
-        """Returns I_i over the views of all processes; per pixel it lies in [0, 1].
+        """Return I_i over the views of all processes; per pixel it lies in [0, 1].
 
         Raises ValueError before the first view: zero scores would remove the whole scene.
         """
@@ -83,7 +83,7 @@ class Importance:
 
 
 def measure_importance(views: Iterable[Contribution], gate: bool = True) -> Float64[Tensor, " n"]:
-    """Returns the scores of all rows over all views; see ``Importance`` for the formula and the errors raised.
+    """Return the scores of all rows over all views; see ``Importance`` for the formula and the errors raised.
 
     >>> view = Contribution(torch.tensor([3.0, 1.0]).double(), torch.tensor([4, 4]), torch.tensor([4, 0]))
     >>> measure_importance([view], gate=False).tolist()
@@ -112,7 +112,7 @@ class WeightRule(PruningRule):
 
     @abstractmethod
     def scores(self, name: str, rows: Rows, weights: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
-        """Returns the scores that rank a node's rows; ``weights``: mean over the views of the summed blend weight."""
+        """Return the scores that rank a node's rows; ``weights``: mean over the views of the summed blend weight."""
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
@@ -191,7 +191,7 @@ class CountRule(PruningRule):
 
     @abstractmethod
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:
-        """Returns the scores that rank a node's rows."""
+        """Return the scores that rank a node's rows."""
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
@@ -207,7 +207,7 @@ class RandomRule(CountRule):
     seed: int = 0
 
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:
-        """Returns random numbers from the node's own stream, the same in every pass over the same rows."""
+        """Return random numbers from the node's own stream, the same in every pass over the same rows."""
         drawn = torch.rand(len(rows), generator=named_generator(self.seed, f"pruning {name}"))
         return drawn.to(rows.means.device)
 

@@ -124,7 +124,7 @@ class LeaveOneOutRule(PruningRule):
     def costs(
         self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
     ) -> dict[str, Float64[Tensor, " _"]]:
-        """Returns name of a node -> the cost of each of its rows, relative to the present squared error."""
+        """Return name of a node -> the cost of each of its rows, relative to the present squared error."""
         none = torch.zeros(3, dtype=torch.float64, device=scene.device)
         ranks = context.ranks
         errors = sum((_squared_errors(scene, frame, context) for frame in on_device(scene, frames, ranks)), none)
@@ -143,7 +143,7 @@ class LeaveOneOutRule(PruningRule):
         return {name: costs[rows] for name, rows in spans.items()}
 
     def _seen(self, frame: Frame, share: Float[Tensor, "3"]) -> Iterator[tuple[View, Float[Tensor, "h w"]]]:
-        """Yields the view and, if asked, the one beside it, with the weight of a squared change of each pixel."""
+        """Yield the view and, if asked, the one beside it, with the weight of a squared change of each pixel."""
         yield frame, torch.einsum("r,rhw->hw", share, _regions(frame))
         if self.beside is not None:
             side = 1 if sum(frame.indices) % 2 else -1
@@ -153,7 +153,7 @@ class LeaveOneOutRule(PruningRule):
 
 
 def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
-    """Returns 1 where a pixel belongs to the whole image, to vehicles, to people; to none where it is of the recording
+    """Return 1 where a pixel belongs to the whole image, to vehicles, to people; to none where it is of the recording
     car, which training does not show to the scene."""
     everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool, device=frame.image.device)
     everywhere = everywhere if frame.ego is None else ~frame.ego
@@ -163,7 +163,7 @@ def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
 
 
 def _without_each(scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], context: RenderContext) -> LeaveOneOut:
-    """Returns the change without each row, after the effects, with the weights of squared changes of the pixels.
+    """Return the change without each row, after the effects, with the weights of squared changes of the pixels.
 
     The largest change is multiplied by the largest slope of any pixel, an upper bound of the visible change.
     """
@@ -183,7 +183,7 @@ def _without_each(scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], 
 
 
 def _squared_errors(scene: SceneGraph, frame: Frame, context: RenderContext) -> Float64[Tensor, "3"]:
-    """Returns the squared error of one frame, summed over pixels and channels, for each of its regions."""
+    """Return the squared error of one frame, summed over pixels and channels, for each of its regions."""
     image = render(scene, frame, context.state, context.options).rgb
     squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
     return (_regions(frame).double() * squared).sum((1, 2))

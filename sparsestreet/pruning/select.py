@@ -54,14 +54,14 @@ class InstanceAreas:
         return bool(self._instances)
 
     def add(self, view: Contribution, spans: Mapping[str, slice]) -> None:
-        """Adds one view of the whole scene; ``spans``: name of a node -> its rows."""
+        """Add one view of the whole scene; ``spans``: name of a node -> its rows."""
         for name, instances in self._instances.items():
             largest = self._pixels[name]
             filled = torch.zeros_like(largest).index_add(0, instances.ids, view.weight[spans[name]].to(largest))
             self._pixels[name] = torch.maximum(largest, filled)
 
     def floors(self, ranks: Ranks = ALONE) -> dict[str, Floors]:
-        """Returns name of every node -> its floors, from the views of all ``ranks``.
+        """Return name of every node -> its floors, from the views of all ``ranks``.
 
         Raises ValueError for an area that is not finite.
         """
@@ -108,7 +108,7 @@ class PruningRule(ABC):
 
     @abstractmethod
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
-        """Returns name of every node that the rule touches -> the rows that stay, never fewer than its floors.
+        """Return name of every node that the rule touches -> the rows that stay, never fewer than its floors.
 
         Computes no gradients. ``frames`` are all training views; each is read when it is indexed.
         """
@@ -118,11 +118,11 @@ class PruningRule(ABC):
         return settings.prunable and (self.nodes is None or name in self.nodes)
 
     def areas(self, scene: SceneGraph) -> InstanceAreas:
-        """Returns an accumulator for the floors of all nodes that the rule touches."""
+        """Return an accumulator for the floors of all nodes that the rule touches."""
         return InstanceAreas({name: node for name, node in scene.nodes.items() if self.touches(name, node.settings)})
 
     def floors(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Floors]:
-        """Returns name of every node that the rule touches -> its floors; renders only if instances have floors.
+        """Return name of every node that the rule touches -> its floors; render only if instances have floors.
 
         A rule that needs ``contributions`` anyway adds them to its own ``areas`` instead.
         """
@@ -134,14 +134,14 @@ class PruningRule(ABC):
 
 
 def on_device(scene: SceneGraph, frames: Sequence[Frame], ranks: Ranks = ALONE) -> Iterator[Frame]:
-    """Yields one frame of this process's share at a time, on the scene's device."""
+    """Yield one frame of this process's share at a time, on the scene's device."""
     return (to_device(frame, scene.device) for frame in ranks.share(frames))
 
 
 def contributions(
     scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
 ) -> Iterator[tuple[Contribution, dict[str, slice]]]:
-    """Yields for each view the contribution of every row of the whole scene, and name of a node -> its rows.
+    """Yield for each view the contribution of every row of the whole scene, and name of a node -> its rows.
 
     Of several processes each looks at its share of the views.
     """
@@ -215,14 +215,14 @@ def keep_by_rank(
 
 
 def _lowest_first(values: Float[Tensor, " n"]) -> Int64[Tensor, " n"]:
-    """Returns rows in order of their values; among equals the later row comes first, as at the floors."""
+    """Return rows in order of their values; among equals the later row comes first, as at the floors."""
     return len(values) - 1 - torch.sort(values.flip(0), stable=True).indices
 
 
 def _keep_in_each(
     scores: Mapping[str, Float[Tensor, " _"]], unwanted: Bool[Tensor, " n"], floors: Mapping[str, Floors]
 ) -> dict[str, Selection]:
-    """Returns the rows that stay of each node; ``unwanted`` marks the rows of all nodes one after the other."""
+    """Return the rows that stay of each node; ``unwanted`` marks the rows of all nodes one after the other."""
     parts = unwanted.split([len(score) for score in scores.values()])
     return {name: keep_best(scores[name], part, *floors[name]) for name, part in zip(scores, parts, strict=True)}
 
@@ -233,7 +233,7 @@ fractions of the rows before the first pass; larger ones are numbers of rows."""
 
 
 def check_keep(keep: Keep) -> None:
-    """Raises ValueError for a value that is neither a fraction nor a number of rows."""
+    """Raise ValueError for a value that is neither a fraction nor a number of rows."""
     values = keep.values() if isinstance(keep, Mapping) else (keep,)
     wrong = [value for value in values if not value >= 0]
     if wrong:
@@ -243,7 +243,7 @@ def check_keep(keep: Keep) -> None:
 def keep_counts(
     scores: Mapping[str, Float[Tensor, " _"]], keep: Keep, floors: Mapping[str, Floors], context: RenderContext
 ) -> dict[str, Selection]:
-    """Keeps so many rows of each node, those with the highest scores, or more if a floor demands it.
+    """Keep so many rows of each node, those with the highest scores, or more if a floor demands it.
 
     Of several passes each leaves the same share of a node's rows, and the last one leaves ``keep``. Among rows of equal
     score the lower one stays. Raises ValueError for scores that are NaN, or a negative floor.

@@ -51,7 +51,7 @@ the configuration's identity."""
 
 
 def flat_config(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Setting]:
-    """Returns a resolved tree of mappings as dotted key -> scalar or list.
+    """Return a resolved tree of mappings as dotted key -> scalar or list.
 
     Empty mappings vanish; infinities and NaN become words.
 
@@ -70,7 +70,7 @@ def flat_config(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Setting]
 
 
 def config_hash(config: Configuration) -> str:
-    """Returns 12 hexadecimal digits of the SHA-256 of the configuration without ``IDENTITY_KEYS``; equal for repeats.
+    """Return 12 hexadecimal digits of the SHA-256 of the configuration without ``IDENTITY_KEYS``; equal for repeats.
 
     >>> config_hash({"seed": 0, "schedule.max_steps": 100}) == config_hash({"seed": 1, "schedule.max_steps": 100})
     True
@@ -92,7 +92,7 @@ def _number_of_devices(config: Configuration) -> Setting:
 
 
 def without(config: Configuration, patterns: Iterable[str]) -> dict[str, Setting]:
-    """Returns the options whose keys match none of the patterns (``*`` matches anything, dots too).
+    """Return the options whose keys match none of the patterns (``*`` matches anything, dots too).
 
     >>> without({"seed": 0, "data.root": "logs", "split.stride": 10}, ("seed", "data.*"))
     {'split.stride': 10}
@@ -102,7 +102,7 @@ def without(config: Configuration, patterns: Iterable[str]) -> dict[str, Setting
 
 
 def only(config: Configuration, patterns: Iterable[str]) -> dict[str, Setting]:
-    """Returns the options whose keys match one of the patterns.
+    """Return the options whose keys match one of the patterns.
 
     >>> only({"seed": 0, "data.root": "logs", "split.stride": 10}, ("data.*",))
     {'data.root': 'logs'}
@@ -112,7 +112,7 @@ def only(config: Configuration, patterns: Iterable[str]) -> dict[str, Setting]:
 
 
 def differing_options(configs: Sequence[Configuration], commands: Iterable[str] = ()) -> list[tuple[str, ...]]:
-    """Returns for each configuration the options in which it differs from any other, such as "split.stride=5".
+    """Return for each configuration the options in which it differs from any other, such as "split.stride=5".
 
     Options whose values vary alike count as interpolations of one option. That one is named: the one that a command
     gave, else the one with the shortest path. A part that some configurations lack reads "with loss.depth" or "without
@@ -142,7 +142,7 @@ def differing_options(configs: Sequence[Configuration], commands: Iterable[str] 
 
 
 def given_keys(commands: Iterable[str]) -> set[str]:
-    """Returns the keys of the options that commands give.
+    """Return the keys of the options that commands give.
 
     >>> sorted(given_keys(["train method=streetgs +loss.depth=0.1"]))
     ['loss.depth', 'method']
@@ -151,7 +151,7 @@ def given_keys(commands: Iterable[str]) -> set[str]:
 
 
 def chosen_options(command: str) -> dict[str, str]:
-    """Returns the choices of groups that a command gives: the group, with its place where it has one -> the option.
+    """Return the choices of groups that a command gives: the group, with its place where it has one -> the option.
 
     >>> chosen_options("sparsestreet train -m pruning@callback.pruning.rule=volume render=fast seed=0 a.b=1")
     {'pruning@callback.pruning.rule': 'volume', 'render': 'fast', 'seed': '0'}
@@ -170,7 +170,7 @@ def _words(command: str) -> list[str]:
 
 
 def key_of(option: str) -> str:
-    """Returns the key of an option as ``differing_options`` words it.
+    """Return the key of an option as ``differing_options`` words it.
 
     >>> key_of("without loss.depth"), key_of("split.stride=5")
     ('loss.depth', 'split.stride')
@@ -179,7 +179,7 @@ def key_of(option: str) -> str:
 
 
 def _missing_part(key: str, configs: Sequence[Configuration]) -> str | None:
-    """Returns the largest part of the tree around ``key`` that is absent from every configuration without the key.
+    """Return the largest part of the tree around ``key`` that is absent from every configuration without the key.
 
     None if only the key itself is absent, or if no configuration lacks it.
     """
@@ -197,7 +197,7 @@ def _has(config: Configuration, part: str) -> bool:
 
 
 def _canonical(value: Setting) -> str:
-    """Returns JSON in which 1 and 1.0 are the same: YAML tells them apart, but nobody means to."""
+    """Return JSON in which 1 and 1.0 are the same: YAML tells them apart, but nobody means to."""
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if isinstance(value, list):

@@ -129,7 +129,7 @@ def update_costs(run: Path, **parts: object) -> None:
 
 
 def stage_costs(seconds: Mapping[str, float]) -> tuple[dict[str, float], dict[str, float]]:
-    """Returns ``phases`` and ``passes`` from the seconds of each stage.
+    """Return ``phases`` and ``passes`` from the seconds of each stage.
 
     >>> stage_costs({"train": 90.0, "prune/ImportanceRule at step 28000": 4.0})
     ({'train': 90.0, 'prune': 4.0}, {'ImportanceRule at step 28000': 4.0})
@@ -145,7 +145,7 @@ def stage_costs(seconds: Mapping[str, float]) -> tuple[dict[str, float], dict[st
 
 
 def step_costs(run: Path) -> dict[str, float]:
-    """Returns ``step_ms`` from a run's ``phases.csv``; empty without the file."""
+    """Return ``step_ms`` from a run's ``phases.csv``; empty without the file."""
     steps: defaultdict[tuple[str, int], float] = defaultdict(float)
     for row in STEP_PHASES.find(run) or ():
         steps[_part(row.phase), row.step] += row.milliseconds

@@ -76,7 +76,7 @@ class LoggedFile(RunFile):
     """Rows whose columns are whatever training logs."""
 
     def rows(self, run: Path) -> list[Logged]:
-        """Returns all rows; none for a run without the file. What a kill left of a line is none.
+        """Return all rows; none for a run without the file. What a kill left of a line is none.
 
         Raises RecordError for what is no text.
         """
@@ -87,7 +87,7 @@ class LoggedFile(RunFile):
         return [row for row in rows if row.get("step", "").isdecimal()]
 
     def write(self, run: Path, rows: Sequence[Logged]) -> None:
-        """Writes the whole file or nothing, with every column that any row has, in order of appearance."""
+        """Write the whole file or nothing, with every column that any row has, in order of appearance."""
         columns = list(dict.fromkeys(name for row in rows for name in row))
         write_atomically(self.path(run), csv_text(columns, [[row.get(name) for name in columns] for row in rows]))
 

@@ -19,7 +19,7 @@ Row = TypeVar("Row")
 
 
 def check_links(run: Path) -> None:
-    """Raises OSError, naming it, for a link in a run's folder that leads out of it: nothing is written through one.
+    """Raise OSError, naming it, for a link in a run's folder that leads out of it: nothing is written through one.
 
     A run may come from anybody. The folder itself may be a link, which its user made.
 
@@ -52,7 +52,7 @@ class RunFile:
     """Its path within the run's folder."""
 
     def path(self, run: Path) -> Path:
-        """Returns its path in the folder of a run."""
+        """Return its path in the folder of a run."""
         return run / self.name
 
     def exists(self, run: Path) -> bool:
@@ -60,11 +60,11 @@ class RunFile:
         return self.path(run).is_file()
 
     def remove(self, run: Path) -> None:
-        """Removes the file from a run that has it."""
+        """Remove the file from a run that has it."""
         self.path(run).unlink(missing_ok=True)
 
     def runs(self, root: Path) -> list[Path]:
-        """Returns the run folders below ``root`` that have the file, sorted."""
+        """Return the run folders below ``root`` that have the file, sorted."""
         depth = len(Path(self.name).parts) - 1
         return [path.parents[depth] for path in sorted(root.rglob(self.name))]
 
@@ -84,15 +84,15 @@ class JsonFile(RunFile, Generic[Record]):
     kind: type[Record]
 
     def read(self, run: Path) -> Record:
-        """Returns the record of a run. Raises RecordError that names the absent file, or the file and the bad entry."""
+        """Return the record of a run. Raises RecordError that names the absent file, or the file and the bad entry."""
         return read_json(self.path(run), self.kind)
 
     def find(self, run: Path) -> Record | None:
-        """Returns the same as ``read``, or None for a run without the file."""
+        """Return the same as ``read``, or None for a run without the file."""
         return self.read(run) if self.exists(run) else None
 
     def write(self, run: Path, record: Record) -> None:
-        """Writes the whole file or nothing. Raises RecordError for values that JSON cannot hold."""
+        """Write the whole file or nothing. Raises RecordError for values that JSON cannot hold."""
         write_json(self.path(run), record)
 
 
@@ -117,7 +117,7 @@ class CsvFile(RunFile, Generic[Row]):
     """How to make the file, such as "train the run"."""
 
     def read(self, run: Path) -> list[Row]:
-        """Returns the rows of a run. Raises RecordError that names the absent file, or the file and the bad line."""
+        """Return the rows of a run. Raises RecordError that names the absent file, or the file and the bad line."""
         path = self.path(run)
         if not path.is_file():
             raise RecordError(f"{path}: does not exist; {self.remedy} first")
@@ -129,11 +129,11 @@ class CsvFile(RunFile, Generic[Row]):
         return [self._parsed(cells, f"{path}, line {number}") for number, cells in enumerate(lines[1:], start=2)]
 
     def find(self, run: Path) -> list[Row] | None:
-        """Returns the same as ``read``, or None for a run without the file."""
+        """Return the same as ``read``, or None for a run without the file."""
         return self.read(run) if self.exists(run) else None
 
     def write(self, run: Path, rows: Iterable[Row]) -> None:
-        """Writes the whole file or nothing. Raises RecordError naming the file and an entry that cannot be written."""
+        """Write the whole file or nothing. Raises RecordError naming the file and an entry that cannot be written."""
         self.write_to(self.path(run), rows)
 
     def write_to(self, path: Path, rows: Iterable[Row]) -> None:
@@ -164,7 +164,7 @@ def csv_lines(path: Path, remedy: str) -> list[list[str]]:
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Returns comma-separated lines; a cell that is None stays blank.
+    """Return comma-separated lines; a cell that is None stays blank.
 
     >>> csv_text(("step", "psnr"), [(100, 24.5), (200, None)])
     'step,psnr\\n100,24.5\\n200,\\n'

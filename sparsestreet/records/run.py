@@ -152,7 +152,7 @@ FAILURE = JsonFile("failed.json", FailedRun)
 
 
 def read_failures(sweep: Path) -> list[tuple[Path, FailedRun]]:
-    """Returns folder and failure of every failed job below a folder, sorted. Raises RecordError for a malformed one."""
+    """Return folder and failure of every failed job below a folder, sorted. Raises RecordError for a malformed one."""
     return [(run, FAILURE.read(run)) for run in FAILURE.runs(sweep)]
 
 
@@ -194,7 +194,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def this_machine() -> Machine:
-    """Returns processor, cores and software versions; no host or user name."""
+    """Return processor, cores and software versions; no host or user name."""
     return Machine(
         processor=processor_name(),
         cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
@@ -205,7 +205,7 @@ def this_machine() -> Machine:
 
 
 def processor_name() -> str:
-    """Returns the processor's model, or its architecture if the system does not name a model."""
+    """Return the processor's model, or its architecture if the system does not name a model."""
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
         for line in cpuinfo.read_text().splitlines():
@@ -216,7 +216,7 @@ def processor_name() -> str:
 
 
 def this_source(package: Path = _PACKAGE) -> CodeVersion:
-    """Returns the commit of the checkout that holds the package, and whether tracked files differ from it.
+    """Return the commit of the checkout that holds the package, and whether tracked files differ from it.
 
     Both are None if git is not installed or no checkout tracks the package. An installed copy inside another
     repository must not carry that repository's commit.
@@ -229,7 +229,7 @@ def this_source(package: Path = _PACKAGE) -> CodeVersion:
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """Returns the output of a git command, or None if git is missing or fails."""
+    """Return the output of a git command, or None if git is missing or fails."""
     try:
         answer = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True)
     except (FileNotFoundError, subprocess.CalledProcessError):

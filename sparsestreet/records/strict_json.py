@@ -26,18 +26,18 @@ class RecordError(ValueError):
 
 
 def version(number: int, remedy: str) -> typing.Any:
-    """Returns the field ``format`` of a record: its number, and what to do about a file of another format."""
+    """Return the field ``format`` of a record: its number, and what to do about a file of another format."""
     return field(default=number, metadata={"remedy": remedy})
 
 
 def write_atomically(path: Path, text: str) -> None:
-    """Writes a whole file or nothing. A reader never sees half of it; a crash leaves the old file."""
+    """Write a whole file or nothing. A reader never sees half of it; a crash leaves the old file."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, value: object) -> None:
-    """Writes a frozen dataclass as indented JSON, floats with 6 significant digits.
+    """Write a frozen dataclass as indented JSON, floats with 6 significant digits.
 
     Raises RecordError, naming the entry, for a NaN, an infinity or a type that JSON does not have.
     """
@@ -46,7 +46,7 @@ def write_json(path: Path, value: object) -> None:
 
 
 def json_line(value: object, where: str) -> str:
-    """Returns a frozen dataclass or a mapping as one line of JSON without newline; numbers, errors as ``write_json``.
+    """Return a frozen dataclass or a mapping as one line of JSON without newline; numbers, errors as ``write_json``.
 
     >>> json_line({"step": 3, "psnr": 24.123456789}, "progress")
     '{"step": 3, "psnr": 24.1235}'
@@ -55,7 +55,7 @@ def json_line(value: object, where: str) -> str:
 
 
 def read_json(path: Path, kind: type[Record]) -> Record:
-    """Reads a dataclass back and checks every type. Raises RecordError naming the file and the entry."""
+    """Read a dataclass back and check every type. Raises RecordError naming the file and the entry."""
     return decoded_json(read_text(path), kind, str(path))
 
 
@@ -74,7 +74,7 @@ def decoded_json(text: str, kind: type[Record], where: str) -> Record:
 
 
 def parsed(text: str, where: str) -> Json:
-    """Returns the value of a JSON text. Raises RecordError, naming ``where``, for NaN or anything else not strict.
+    """Return the value of a JSON text. Raises RecordError, naming ``where``, for NaN or anything else not strict.
 
     >>> parsed('{"psnr": 24.5}', "summary.json")
     {'psnr': 24.5}
@@ -88,7 +88,7 @@ def parsed(text: str, where: str) -> Json:
 
 
 def significant(value: float, where: str) -> float:
-    """Returns the value rounded to 6 significant digits: far below the noise of any measurement, readable in a diff.
+    """Return the value rounded to 6 significant digits: far below the noise of any measurement, readable in a diff.
 
     Raises RecordError, naming the entry ``where``, for a NaN or an infinity.
 
@@ -124,7 +124,7 @@ def _encoded(value: object, where: str, exact: bool = False) -> Json:
 
 
 def _decoded(kind: typing.Any, value: Json, where: str) -> typing.Any:
-    """Returns ``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None, or one of plain types."""
+    """Return ``value`` as ``kind``: a dataclass, dict[str, X], tuple[X, ...], X | None, or one of plain types."""
     if isinstance(kind, type) and is_dataclass(kind):
         return _decoded_dataclass(kind, value, where)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
@@ -142,7 +142,7 @@ def _decoded(kind: typing.Any, value: Json, where: str) -> typing.Any:
 
 
 def _decoded_union(kinds: tuple[typing.Any, ...], value: Json, where: str) -> typing.Any:
-    """Returns ``value`` as a union: None and one kind of any sort, or several plain kinds."""
+    """Return ``value`` as a union: None and one kind of any sort, or several plain kinds."""
     if type(value) in kinds:
         return value
     others = [kind for kind in kinds if kind is not types.NoneType]
@@ -174,7 +174,7 @@ def _decoded_dataclass(kind: type, value: Json, where: str) -> typing.Any:
 
 
 def _of(kind: type, value: Json, where: str) -> typing.Any:
-    """Returns ``value`` if it is a ``kind``; a bool is no int here. Raises RecordError otherwise."""
+    """Return ``value`` if it is a ``kind``; a bool is no int here. Raises RecordError otherwise."""
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise RecordError(f"{where}: expected {kind.__name__}, got {type(value).__name__} {value!r}")
     return value

@@ -51,12 +51,12 @@ class FrameQuality:
     An empty region has 0 pixels."""
 
     def value(self, quantity: str, region: str) -> float | None:
-        """Returns one metric, such as ("psnr", "vehicle"); None if the region is absent or empty."""
+        """Return one metric, such as ("psnr", "vehicle"); None if the region is absent or empty."""
         found = self.regions.get(region)
         return None if found is None else getattr(found, quantity)
 
     def pixels(self, region: str) -> int:
-        """Returns the number of pixels of a region; 0 if it is absent."""
+        """Return the number of pixels of a region; 0 if it is absent."""
         return self.regions[region].pixels if region in self.regions else 0
 
 
@@ -75,7 +75,7 @@ class MetricSummary:
 
 
 def summarize(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
-    """Returns id of each metric of ``DEFINITIONS`` -> its summary over the images that have the region.
+    """Return id of each metric of ``DEFINITIONS`` -> its summary over the images that have the region.
 
     >>> image = FrameQuality(0, 0, 64, 48, {"full": RegionQuality(pixels=3072, mse=0.01, psnr=20.0, ssim_uniform7=0.8)})
     >>> summarize([image])["psnr_full"]
@@ -92,7 +92,7 @@ def summarize(quality: Iterable[FrameQuality]) -> dict[str, MetricSummary]:
 
 
 def camera_means(quality: Iterable[FrameQuality]) -> dict[str, dict[str, float | None]]:
-    """Returns number of a camera, in order -> id of a metric -> its mean over the camera's images with the region."""
+    """Return number of a camera, in order -> id of a metric -> its mean over the camera's images with the region."""
     images = list(quality)
     return {
         str(camera): {
@@ -115,7 +115,7 @@ _COLUMNS = (
 
 
 def _cells(image: FrameQuality) -> Sequence[object]:
-    """Returns the cells of an image.
+    """Return the cells of an image.
 
     A region's cells are blank if the data has no such mask or no lidar. Its metrics are blank if it has 0 pixels.
     """
@@ -202,7 +202,7 @@ class Latency:
 
     @property
     def protocol(self) -> str:
-        """Says in words how the median of a frame was taken."""
+        """Say in words how the median of a frame was taken."""
         return (
             f"{self.clocks[FRAME].repeats} renders cycling through {self.views} views after {self.warmup} warm-up "
             "renders, batch 1, device synchronized, scene assembly to uint8, without loading and metrics"
@@ -220,7 +220,7 @@ class ClockRow:
 
 
 def clock_rows(latency: Latency) -> Iterator[ClockRow]:
-    """Yields a row for each clock."""
+    """Yield a row for each clock."""
     for gaussians, clocks in (("masked" if latency.removed else "all", latency.clocks), ("removed", latency.removed)):
         for clock, percentiles in clocks.items():
             yield ClockRow(clock, gaussians, percentiles)
@@ -321,12 +321,12 @@ class RunSummary:
         return HELD_OUT if HELD_OUT in self.quality else TRAINING
 
     def mean(self, metric: str, split: str | None = None) -> float | None:
-        """Returns the mean of a metric over the images of a split (default ``main_split``); None if not measured."""
+        """Return the mean of a metric over the images of a split (default ``main_split``); None if not measured."""
         found = self.quality.get(split or self.main_split, {}).get(metric)
         return None if found is None else found.mean
 
     def camera_mean(self, metric: str, camera: str) -> float | None:
-        """Returns the mean of a metric over one camera's images of ``main_split``; None if not measured."""
+        """Return the mean of a metric over one camera's images of ``main_split``; None if not measured."""
         return self.by_camera[self.main_split].get(camera, {}).get(metric)
 
 

@@ -24,7 +24,7 @@ class RunRecord:
 
 
 def collect(roots: Iterable[Path]) -> list[RunRecord]:
-    """Returns every run below the given folders once, sorted by path.
+    """Return every run below the given folders once, sorted by path.
 
     Raises FileNotFoundError for a root without records, RecordError (naming the file) for a malformed one.
     """
@@ -82,7 +82,7 @@ def _kept(summary: RunSummary) -> dict[str, object]:
 
 
 def check_definitions(records: Sequence[RunRecord]) -> None:
-    """Raises ValueError if two records define one metric differently."""
+    """Raise ValueError if two records define one metric differently."""
     seen: dict[str, tuple[str, Path]] = {}
     for record in records:
         for name, definition in record.summary.definitions.items():

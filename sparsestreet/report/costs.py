@@ -69,7 +69,7 @@ _HEADER = (
 
 
 def what_effects_cost(variants: Sequence[Variant]) -> Grid:
-    """Returns a row for each effect of each variant's plan; numbers are means over the variant's runs."""
+    """Return a row for each effect of each variant's plan; numbers are means over the variant's runs."""
     rows = [row for variant in variants for row in _rows(variant)]
     notes = [
         "measured: frames and PSNR of the finished scene with the effect, less those without it; a scene that was "
@@ -126,7 +126,7 @@ def _cells(name: str, found: Sequence[EffectDecision], costs: Sequence[CostRecor
 
 
 def _busy(costs: Sequence[CostRecord | None]) -> bool:
-    """Returns whether a machine was not quiet while frames were timed with and without each effect."""
+    """Return whether a machine was not quiet while frames were timed with and without each effect."""
     return any(cost is not None and cost.noise is not None and not cost.noise.quiet for cost in costs)
 
 
@@ -159,7 +159,7 @@ class QualityCurve:
 
 
 def curves_of_runs(variant: Variant) -> dict[Unit, list[QualityCurve]]:
-    """Returns scene and seed -> the curves of its runs, for the runs that hold views out and have a curve."""
+    """Return scene and seed -> the curves of its runs, for the runs that hold views out and have a curve."""
     found = {
         unit: [_curve(HELD_OUT_CURVE.find(run.folder) or ()) for run in runs] for unit, runs in variant.runs().items()
     }
@@ -168,12 +168,12 @@ def curves_of_runs(variant: Variant) -> dict[Unit, list[QualityCurve]]:
 
 
 def curves_of(variant: Variant) -> dict[Unit, QualityCurve]:
-    """Returns scene and seed -> the curve of its run, or the mean of several runs."""
+    """Return scene and seed -> the curve of its run, or the mean of several runs."""
     return {unit: mean_curve(curves) for unit, curves in curves_of_runs(variant).items()}
 
 
 def mean_curve(curves: Sequence[QualityCurve]) -> QualityCurve:
-    """Returns mean seconds and mean dB at each look that all curves have.
+    """Return mean seconds and mean dB at each look that all curves have.
 
     >>> mean_curve([QualityCurve((10.0, 20.0), (22.0, 25.0)), QualityCurve((14.0,), (24.0,))])
     QualityCurve(seconds=(12.0,), psnr=(23.0,))
@@ -189,7 +189,7 @@ def _curve(looks: Sequence[HeldOutLook]) -> QualityCurve:
 
 
 def seconds_to(curve: QualityCurve, psnr: float) -> float | None:
-    """Returns the training seconds at the first look with at least this PSNR, or None; looks are not interpolated.
+    """Return the training seconds at the first look with at least this PSNR, or None; looks are not interpolated.
 
     >>> seconds_to(QualityCurve(seconds=(10.0, 20.0), psnr=(22.0, 25.0)), 24.0)
     20.0
@@ -198,7 +198,7 @@ def seconds_to(curve: QualityCurve, psnr: float) -> float | None:
 
 
 def time_to_quality(variants: Sequence[Variant]) -> Grid | None:
-    """Returns median seconds to the plain run's last PSNR minus 1, 0.5 and 0.1 dB; None if no run has a curve."""
+    """Return median seconds to the plain run's last PSNR minus 1, 0.5 and 0.1 dB; None if no run has a curve."""
     curves = {variant.name: curves_of(variant) for variant in variants}
     if not any(curves.values()):
         return None
@@ -245,7 +245,7 @@ def mean_beside(variant: Variant, column: str) -> float | None:
 
 
 def beside_the_path(variants: Sequence[Variant]) -> Grid | None:
-    """Returns PSNR and LPIPS to the truth and every recorded distance, by meters; None if no run recorded any."""
+    """Return PSNR and LPIPS to the truth and every recorded distance, by meters; None if no run recorded any."""
     measured = [shifts_of(record.folder) for variant in variants for record in variant.records]
     found = {(name, meters) for shifts in measured for meters, numbers in shifts.items() for name in numbers}
     columns = sorted(found, key=lambda column: (column[0] not in _PLACES, _PLACES.get(column[0], 0), column))
@@ -277,7 +277,7 @@ _COSTS = (("", "dB to exact", "{:.1f}"), ("", "ms/frame", "{:.2f}"))
 
 
 def rendered_otherwise(variants: Sequence[Variant], protocol: Protocol) -> Grid | None:
-    """Returns a row for each variant and preset that its runs have; None if no run has any.
+    """Return a row for each variant and preset that its runs have; None if no run has any.
 
     Raises RecordError for a malformed record.
     """

@@ -69,7 +69,7 @@ PARETO_COSTS = (
 
 
 def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with panels in one row."""
+    """Return a figure with panels in one row."""
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(width * columns, height), layout="constrained")
         figure.patch.set_alpha(0)
@@ -84,7 +84,7 @@ Says = dict[str, list[str]]
 
 
 def write_svg(figure: Figure, path: Path, says: Says | None = None) -> None:
-    """Writes the figure as SVG in the page's own text color; the same numbers give the same bytes.
+    """Write the figure as SVG in the page's own text color; the same numbers give the same bytes.
 
     Artists whose ``gid`` is a key of ``says`` have marks that say something: a ``<title>`` each, in their order.
     """
@@ -102,7 +102,7 @@ def write_svg(figure: Figure, path: Path, says: Says | None = None) -> None:
 
 
 def _titled(svg: str, name: str, texts: Sequence[str]) -> str:
-    """Returns the figure with a title in each mark of a group. Raises ValueError where it has fewer marks."""
+    """Return the figure with a title in each mark of a group. Raises ValueError where it has fewer marks."""
     head, group, tail = svg.partition(f'<g id="{name}">')
     tail, behind, rest_of_figure = tail.partition('<g id="')
     rest = iter(texts)
@@ -133,7 +133,7 @@ class Style:
 
 
 def styles(variants: Sequence[Variant]) -> dict[str, Style]:
-    """Returns name of a variant -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
+    """Return name of a variant -> how it is drawn, with one color a method, and one color, marker and dash a kind."""
     methods, kinds = list(dict.fromkeys(variant.plain_label for variant in variants)), _kinds(variants)
     every = list(dict.fromkeys(kinds.values()))
     known = {"none": 0, "paper": 1, "paper_short": 1, "removal": 2, "masks": 3, "importance": 4}
@@ -153,7 +153,7 @@ def styles(variants: Sequence[Variant]) -> dict[str, Style]:
 
 
 def _kinds(variants: Sequence[Variant]) -> dict[str, str]:
-    """Returns name of a variant -> its sparsification, or all that its name says beside its method."""
+    """Return name of a variant -> its sparsification, or all that its name says beside its method."""
     of_method = Counter((variant.plain_label, variant.sparsify) for variant in variants)
     several = {sparsify for (_, sparsify), number in of_method.items() if number > 1}
     return {
@@ -165,7 +165,7 @@ def _kinds(variants: Sequence[Variant]) -> dict[str, str]:
 
 
 def _in_turn(kinds: Sequence[str], known: Mapping[str, T], spare: Sequence[T]) -> dict[str, T]:
-    """Returns kind -> the value that it is known by, or the next that no other has; in turn where all are taken."""
+    """Return kind -> the value that it is known by, or the next that no other has; in turn where all are taken."""
     found: dict[str, T] = {}
     for kind in kinds:
         if kind in known and known[kind] not in found.values():
@@ -182,7 +182,7 @@ def _in_legend(variant: Variant, kind: str) -> str:
 
 
 def short(value: float) -> str:
-    """Returns a number in short form.
+    """Return a number in short form.
 
     >>> short(12e3), short(1.5e6), short(950.0)
     ('12k', '1.5M', '950')
@@ -192,7 +192,7 @@ def short(value: float) -> str:
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Returns the Pareto front of (cost, quality) points, sorted by cost.
+    """Return the Pareto front of (cost, quality) points, sorted by cost.
 
     >>> front([(1.0, 20.0), (2.0, 25.0), (3.0, 24.0)])
     [(1.0, 20.0), (2.0, 25.0)]
@@ -205,7 +205,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
 
 
 def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str, str], path: Path) -> bool:
-    """Draws quality of the full image, people and vehicles against one cost. Returns whether there was any to draw.
+    """Draw quality of the full image, people and vehicles against one cost. Returns whether there was any to draw.
 
     Every run is a small mark, every variant's mean a large one, with an arrow from plain to pruned. The front is that
     of the means; controls are gray and in no front.
@@ -277,13 +277,13 @@ def _pareto_panel(axes: Axes, variants: Sequence[Variant], of: tuple[str, str, s
 
 
 def _paint(style: Mapping[str, Style], variant: Variant) -> str:
-    """Returns the color of the method, or of the kind if there is one method."""
+    """Return the color of the method, or of the kind if there is one method."""
     own = style[variant.name]
     return own.color if len({one.method for one in style.values()} - {GREY}) <= 1 else own.method
 
 
 def legend_below(figure: Figure, handles: Sequence[Artist]) -> None:
-    """Adds a legend below the panels, in as many columns as its longest name lets fit; its further rows add height."""
+    """Add a legend below the panels, in as many columns as its longest name lets fit; its further rows add height."""
     longest = max(len(str(handle.get_label())) for handle in handles)
     columns = max(1, min(4, int(figure.get_figwidth() / (0.4 + 0.065 * longest))))
     rows = -(-len(handles) // columns)
@@ -299,7 +299,7 @@ def _in_words(point: Sequence[float], unit: str) -> str:
 def paired_means(
     variant: Variant, plain: Variant | None, cost: str, quality: str
 ) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """Returns where an arrow starts and ends: the means of the plain variant and of a variant over the units of both.
+    """Return where an arrow starts and ends: the means of the plain variant and of a variant over the units of both.
 
     None for the plain variant itself, without one, and without a common unit.
     """
@@ -416,7 +416,7 @@ def _counts(axes: Axes, look: Style, folder: Path) -> None:
 
 
 def frame_waterfall(variants: Sequence[Variant], path: Path) -> bool:
-    """Draws the additional time of a frame with each node and effect, a bar a variant. Returns whether a run has it."""
+    """Draw the additional time of a frame with each node and effect, a bar a variant. Returns whether a run has it."""
     costs = {variant.name: _frame_costs(variant) for variant in variants}
     drawn = [variant for variant in variants if costs[variant.name]]
     if not drawn:
@@ -446,7 +446,7 @@ def frame_waterfall(variants: Sequence[Variant], path: Path) -> bool:
 
 
 def _frame_costs(variant: Variant) -> dict[str, float]:
-    """Returns node or effect -> mean milliseconds over the runs that recorded it."""
+    """Return node or effect -> mean milliseconds over the runs that recorded it."""
     found: dict[str, list[float]] = {}
     for costs in filter(None, (COSTS.find(record.folder) for record in variant.records)):
         parts = {name: node.ms for name, node in costs.nodes.items()}
@@ -460,7 +460,7 @@ def _line(look: Style) -> dict[str, Any]:
 
 
 def _legends(figure: Figure, axes: Sequence[Axes]) -> None:
-    """Adds a legend to each panel, or one below all of them if it would hide the curves."""
+    """Add a legend to each panel, or one below all of them if it would hide the curves."""
     named = [dict(zip(*reversed(one.get_legend_handles_labels()), strict=True)) for one in axes]
     if max(map(len, named)) <= _MAX_NAMES_IN_PANEL:
         for one, once in zip(axes, named, strict=True):
@@ -474,7 +474,7 @@ _DASHES_OF_KIND = {"plain": "-", "paper": "--", "paper_short": "--", "removal": 
 
 
 def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> None:
-    """Writes a PNG: held-out PSNR over training seconds and over milliseconds a frame, without controls.
+    """Write a PNG: held-out PSNR over training seconds and over milliseconds a frame, without controls.
 
     Curves are means over scenes and seeds at each look. Without curves, only the end of training is drawn. Raises
     ValueError if no run has a held-out PSNR.

@@ -43,7 +43,7 @@ class Page:
 
 
 def html(page: Page) -> str:
-    """Returns the whole file."""
+    """Return the whole file."""
     sets = _sets(page.grids)
     parts = [
         f"<h1>{escape(page.title)}</h1>",
@@ -96,7 +96,7 @@ def _summary_line(sentences: Sequence[str]) -> str:
 
 
 def _sets(grids: Sequence[Grid]) -> dict[tuple[str, ...], str]:
-    """Returns names of the runs that a number comes from -> the place on the page that lists them."""
+    """Return names of the runs that a number comes from -> the place on the page that lists them."""
     several = dict.fromkeys(cell.runs for grid in grids for row in grid.rows for cell in row if len(cell.runs) > 1)
     return {runs: f"of-{index}" for index, runs in enumerate(several)}
 
@@ -209,7 +209,7 @@ def _steady(steady: bool) -> str:
 
 
 def _configurations(records: Sequence[RunRecord]) -> list[str]:
-    """Returns each configuration once. Options outside its identity have the values of its first run."""
+    """Return each configuration once. Options outside its identity have the values of its first run."""
     once: dict[str, RunRecord] = {}
     for record in records:
         once.setdefault(record.summary.run.config_hash, record)
@@ -228,7 +228,7 @@ VIEWS = 2
 
 
 def comparison_data(variants: Sequence[Variant]) -> str | None:
-    """Returns JSON of the views with their images as data URLs, truth first; None if there is no view to compare.
+    """Return JSON of the views with their images as data URLs, truth first; None if there is no view to compare.
 
     Each scene shows one seed, which most of the variants have (the lowest of several), and the first ``VIEWS`` views
     that evaluation drew.

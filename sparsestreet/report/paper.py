@@ -43,7 +43,7 @@ class PublishedTable:
     """What the paper says about the views of its numbers."""
 
     def values(self, row: PublishedRow) -> Mapping[Key, float | None]:
-        """Returns column -> number."""
+        """Return column -> number."""
         return dict(zip(self.columns, row.values, strict=True))
 
 
@@ -73,7 +73,7 @@ _SHIFTED = tuple(("novel", f"{meters} m", "fid") for meters in (1, 2, 3))
 
 
 def _rows(text: str) -> tuple[PublishedRow, ...]:
-    """Parses lines: name | method | sparsification and words of the variant's name | numbers as printed, in order."""
+    """Parse lines: name | method | sparsification and words of the variant's name | numbers as printed, in order."""
     return tuple(_row_published(*(part.strip() for part in line.split("|"))) for line in text.strip().splitlines())
 
 
@@ -165,7 +165,7 @@ _TEXTS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "fid": "{:.2f}"
 def paper_table(
     variants: Sequence[Variant], failures: Sequence[tuple[Path, FailedRun]], protocol: Protocol, sweep: str | None
 ) -> Grid:
-    """Returns the paper's table that a sweep reproduces; for any other sweep, its variants in the layout of Table 1."""
+    """Return the paper's table that a sweep reproduces; for any other sweep, its variants in the layout of Table 1."""
     table = TABLES.get(sweep or "", LAYOUT)
     left = list(variants)
     rows = []
@@ -244,7 +244,7 @@ def _column(key: Key, protocol: Protocol) -> str | None:
 
 
 def metric_id(protocol: Protocol, region: str, quantity: str) -> str | None:
-    """Returns the id of a metric under a protocol, or None.
+    """Return the id of a metric under a protocol, or None.
 
     >>> from sparsestreet.metrics.definitions import DRIVESTUDIO
     >>> metric_id(DRIVESTUDIO, "full", "psnr") == DRIVESTUDIO.psnr

@@ -15,7 +15,7 @@ _VIEWS = {HELD_OUT: "held-out views", TRAINING: "training views"}
 
 
 def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDIO) -> list[str]:
-    """Returns quality of each split, size and time, and where the pictures are; absent numbers are left out.
+    """Return quality of each split, size and time, and where the pictures are; absent numbers are left out.
 
     Args:
         summary: the record of the run.

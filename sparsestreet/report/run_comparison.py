@@ -12,7 +12,7 @@ from sparsestreet.report.variants import repeats
 def compare_runs(
     runs: Sequence[Path], sheet: Path, *, legend: Legend | None = None, titles: Sequence[str] | None = None
 ) -> None:
-    """Writes a sheet with a column for each run: renders, errors and centers of the images that all of them show.
+    """Write a sheet with a column for each run: renders, errors and centers of the images that all of them show.
 
     Args:
         runs: at least two run folders with records and pictures of the same images. Shares refer to the first.
@@ -37,7 +37,7 @@ def compare_runs(
 
 
 def _names(summaries: Sequence[RunSummary]) -> list[str]:
-    """Returns names as in the report's tables, with the seed if only the seed tells two runs apart."""
+    """Return names as in the report's tables, with the seed if only the seed tells two runs apart."""
     found = repeats(summaries)
     names = [next(variant.name for variant in found if summary in variant.runs) for summary in summaries]
     return [

@@ -20,7 +20,7 @@ from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
 
 
 def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) -> list[str]:
-    """Returns the notes of one table: first the general ones, then those about its runs."""
+    """Return the notes of one table: first the general ones, then those about its runs."""
     runs = [run for variant in variants for run in variant.runs]
     return [
         *_general(runs, over_scenes, protocol),
@@ -39,7 +39,7 @@ def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) ->
 
 
 def camera_notes(variants: Sequence[Repeats]) -> list[str]:
-    """Returns the notes of a table by camera. All other notes stand below the table that precedes it."""
+    """Return the notes of a table by camera. All other notes stand below the table that precedes it."""
     runs = [run for variant in variants for run in variant.runs]
     return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
 
@@ -62,7 +62,7 @@ def _general(runs: Sequence[RunSummary], over_scenes: bool, protocol: Protocol) 
 
 
 def _absent(runs: Sequence[RunSummary], protocol: Protocol) -> list[str]:
-    """Says why a metric of the protocol is absent, once for each reason."""
+    """Say why a metric of the protocol is absent, once for each reason."""
     reasons = {
         (quantity, reason)
         for run in runs
@@ -77,7 +77,7 @@ def _views(runs: Sequence[RunSummary]) -> str:
 
 
 def _lidar(runs: Sequence[RunSummary]) -> list[str]:
-    """Says what near and beyond are if a run has either."""
+    """Say what near and beyond are if a run has either."""
     names = ("psnr_near_lidar", "psnr_beyond_lidar")
     if all(run.mean(name) is None for run in runs for name in names):
         return []
@@ -131,7 +131,7 @@ def _long_names(variants: Sequence[Repeats]) -> list[str]:
 
 
 def _repeated_seeds(variants: Sequence[Repeats]) -> list[str]:
-    """Names seeds that occur twice: such a run counts twice, but it is no independent repeat."""
+    """Name seeds that occur twice: such a run counts twice, but it is no independent repeat."""
     said = []
     for variant in variants:
         times = Counter(_scenes_and_seeds(variant))
@@ -170,7 +170,7 @@ def _unfinished(variants: Sequence[Repeats]) -> list[str]:
 
 
 def _scenes(variants: Sequence[Repeats]) -> list[str]:
-    """Names the scenes of a mean, and the variants whose mean is over fewer."""
+    """Name the scenes of a mean, and the variants whose mean is over fewer."""
     every = sorted({run.run.scene for variant in variants for run in variant.runs})
     said = [f"scenes: {', '.join(every)}"]
     for variant in variants:
@@ -193,7 +193,7 @@ def _caps(variants: Sequence[Repeats]) -> list[str]:
 
 
 def _guards(variants: Sequence[Repeats]) -> str:
-    """Returns the alarms of every run that has any."""
+    """Return the alarms of every run that has any."""
     fired = [
         f"{_run(variant, run)} " + ", ".join(f"{name} {count:,}" for name, count in run.guards.alarms.items())
         for variant in variants
@@ -225,7 +225,7 @@ class Quantity:
 
 
 def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
-    """Returns heading, id and format of each metric of a protocol, and of the metrics by lidar.
+    """Return heading, id and format of each metric of a protocol, and of the metrics by lidar.
 
     >>> [heading for heading, _, _ in protocol_metrics(DRIVESTUDIO)][:2]
     ['PSNR', 'SSIM']
@@ -328,7 +328,7 @@ class _Group:
 def sections(
     records: Sequence[RunRecord], baseline: str | None = None, protocol: Protocol = DRIVESTUDIO
 ) -> list[Section]:
-    """Returns a section for each scene, split and resolution, then sections of means over scenes.
+    """Return a section for each scene, split and resolution, then sections of means over scenes.
 
     A scene has a row for each variant (runs of one label and configuration) with mean and spread over its runs. If a
     variant occurs in at least two scenes of a split, a section of means follows, in which each scene counts once. If
@@ -391,7 +391,7 @@ def _log_of_any_clip(run: RunSummary) -> dict[str, Setting]:
 
 
 def _titles(groups: Sequence[_Group]) -> list[str]:
-    """Returns each group's title; groups that would share a title add how their logs were read."""
+    """Return each group's title; groups that would share a title add how their logs were read."""
     titles = []
     for group in groups:
         alike = [other for other in groups if other.title == group.title]
@@ -401,7 +401,7 @@ def _titles(groups: Sequence[_Group]) -> list[str]:
 
 
 def _reference(found: Sequence[Repeats], baseline: str | None) -> Repeats | None:
-    """Returns the variant with the baseline's name, or the only one with its label; None if there is none."""
+    """Return the variant with the baseline's name, or the only one with its label; None if there is none."""
     named = [variant for variant in found if variant.name == baseline]
     of_label = [variant for variant in found if variant.label == baseline]
     if not named and len(of_label) > 1:
@@ -413,7 +413,7 @@ def _reference(found: Sequence[Repeats], baseline: str | None) -> Repeats | None
 def _sections(
     group: _Group, title: str, found: Sequence[Repeats], baseline: str | None, protocol: Protocol
 ) -> list[Section]:
-    """Returns the table of a group, and the one by camera if there are several cameras."""
+    """Return the table of a group, and the one by camera if there are several cameras."""
     reference = _reference(found, baseline)
     ordered = sorted(found, key=lambda variant: (variant is not reference, variant.name))
     said = notes(ordered, group.over_scenes, protocol)
@@ -486,7 +486,7 @@ _MAX_COLUMNS = 5
 
 
 def section_tables(sections: Sequence[Section], width: int = 80) -> list[Table | Text]:
-    """Returns title, tables and notes of the sections for ``rich.console.Console``, ``width`` characters wide.
+    """Return title, tables and notes of the sections for ``rich.console.Console``, ``width`` characters wide.
 
     Variants are columns, spread over as many tables as needed to cut no text. Many variants (a sweep) are rows if the
     terminal is wide enough.
@@ -495,7 +495,7 @@ def section_tables(sections: Sequence[Section], width: int = 80) -> list[Table |
 
 
 def sections_markdown(sections: Sequence[Section]) -> str:
-    """Returns the sections as Markdown tables with notes; sections by camera have a row for each camera and region."""
+    """Return the sections as Markdown tables with notes; sections by camera have a row for each camera and region."""
     blocks = []
     for section in sections:
         lines = _lines(section)
@@ -509,7 +509,7 @@ def sections_markdown(sections: Sequence[Section]) -> str:
 
 
 def size_figure(records: Sequence[RunRecord], path: Path) -> None:
-    """Writes a scatter of all runs: PSNR of held-out views against Gaussians, one color for each variant.
+    """Write a scatter of all runs: PSNR of held-out views against Gaussians, one color for each variant.
 
     Raises ValueError if no run has held-out views.
     """
@@ -538,7 +538,7 @@ def _drawn(section: Section, width: int) -> list[Table | Text]:
 
 
 def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[list[Sequence[str]]]:
-    """Returns consecutive columns in groups that fit a width, at least one column in each."""
+    """Return consecutive columns in groups that fit a width, at least one column in each."""
     groups: list[list[Sequence[str]]] = []
     left = 0
     for column in columns:
@@ -551,7 +551,7 @@ def _fitting(columns: Sequence[Sequence[str]], width: int) -> list[list[Sequence
 
 
 def _room(column: Sequence[str]) -> int:
-    """Returns the width of a column in characters: its heading may break between words, its cells may not."""
+    """Return the width of a column in characters: its heading may break between words, its cells may not."""
     heading, *cells = column
     return max(*map(len, heading.split()), *map(len, cells)) + 3
 
@@ -566,7 +566,7 @@ def _table(lines: Sequence[Sequence[str]]) -> Table:
 
 
 def _lines(section: Section) -> list[list[str]]:
-    """Returns header and rows as texts."""
+    """Return header and rows as texts."""
     header = ["method", "runs", *(quantity.heading for quantity in section.quantities)]
     return [header, *(_texts(row, section.quantities) for row in section.rows)]
 
@@ -578,7 +578,7 @@ def _texts(row: Row, quantities: Sequence[Quantity]) -> list[str]:
 
 
 def _cell(cell: Spread | None, quantity: Quantity, busy: bool, row: Row) -> str:
-    """Returns mean ± sd, marks of a count that a cap limited and of a time of a busy machine, and n if it differs.
+    """Return mean ± sd, marks of a count that a cap limited and of a time of a busy machine, and n if it differs.
 
     A difference holds no time of a busy machine: it has the mark alone where nothing else is left.
     """

@@ -35,7 +35,7 @@ class SweepReport:
 
 
 def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIVESTUDIO) -> SweepReport:
-    """Writes ``sweep/report/``: tables.md, tables.tex, tables.csv, figures/ and index.html.
+    """Write ``sweep/report/``: tables.md, tables.tex, tables.csv, figures/ and index.html.
 
     Args:
         sweep: the folder of a sweep; runs that failed have a ``failed.json`` in it.
@@ -80,7 +80,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
 
 
 def sweep_records(sweep: Path) -> list[RunRecord]:
-    """Returns the records of a sweep's runs that did not fail. Raises the same errors as ``write_report``."""
+    """Return the records of a sweep's runs that did not fail. Raises the same errors as ``write_report``."""
     # The folder of a failed run may hold the record of an earlier configuration.
     records = [record for record in collect([sweep]) if not FAILURE.exists(record.folder)]
     if not records:
@@ -158,7 +158,7 @@ def _effects_alike(found: Sequence[Variant]) -> list[str]:
 
 
 def _baseline(found: Sequence[Variant]) -> list[str]:
-    """Says why there are no differences: no variant is the plain one of another."""
+    """Say why there are no differences: no variant is the plain one of another."""
     if len(found) < 2 or any(plain_of(variant, found) not in (None, variant) for variant in found):
         return []
     return [

@@ -29,7 +29,7 @@ class Cell:
 
 
 def number_cell(value: float | None, form: str, runs: tuple[str, ...], mark: str = "") -> Cell:
-    """Returns a rounded number, with a mark if one is given, and its exact value.
+    """Return a rounded number, with a mark if one is given, and its exact value.
 
     >>> number_cell(0.123456, "{:.2f}", ("run0",))
     Cell(text='0.12', bold=False, published=False, runs=('run0',), exact='0.123456')
@@ -78,7 +78,7 @@ def without_empty(
 
 
 def markdown(grids: Sequence[Grid]) -> str:
-    """Returns the tables with their notes as Markdown.
+    """Return the tables with their notes as Markdown.
 
     >>> grid = Grid("size", "Size", (("", "arm"), ("", "MB")), ((Cell("plain"), Cell("3.2", bold=True)),), ())
     >>> print(markdown([grid]).strip())
@@ -105,7 +105,7 @@ def markdown_lines(lines: Iterable[Iterable[str]]) -> str:
 
 
 def latex(grids: Sequence[Grid]) -> str:
-    """Returns the tables as LaTeX for ``booktabs``; published numbers are in italics."""
+    """Return the tables as LaTeX for ``booktabs``; published numbers are in italics."""
     return "% \\usepackage{booktabs,graphicx}\n" + "\n".join(_latex(grid) for grid in grids)
 
 
@@ -136,7 +136,7 @@ def _escaped(text: str) -> str:
 
 
 def comma_separated(grids: Sequence[Grid]) -> str:
-    """Returns the tables as one CSV, a line a cell: table, row, column, value, whether published, whether bold, runs.
+    """Return the tables as one CSV, a line a cell: table, row, column, value, whether published, whether bold, runs.
 
     >>> grid = Grid("size", "Size", (("", "arm"), ("", "MB")), ((Cell("plain"), Cell("3.2", runs=("run0",))),), ())
     >>> comma_separated([grid]).splitlines()[1]
@@ -162,7 +162,7 @@ class Spread:
 
 
 def spread(values: Sequence[float]) -> Spread | None:
-    """Returns mean and sample standard deviation; None without values.
+    """Return mean and sample standard deviation; None without values.
 
     >>> spread([24.0, 26.0, 28.0])
     Spread(mean=26.0, sd=2.0, n=3)
@@ -192,7 +192,7 @@ class ConfidenceInterval:
 
 
 def t_interval(values: Sequence[float]) -> ConfidenceInterval | None:
-    """Returns the mean and the t interval with n - 1 degrees of freedom; None without values.
+    """Return the mean and the t interval with n - 1 degrees of freedom; None without values.
 
     >>> interval = t_interval([0.2, 0.3, 0.4])
     >>> f"{interval.mean:.2f} [{interval.low:.2f}, {interval.high:.2f}]", interval.proven

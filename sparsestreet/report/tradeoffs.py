@@ -42,7 +42,7 @@ class Measure:
 
 
 def measures(protocol: Protocol) -> tuple[Measure, ...]:
-    """Returns the columns of quality under a protocol, and of its costs."""
+    """Return the columns of quality under a protocol, and of its costs."""
     quality = (
         ("PSNR full", protocol.psnr, "{:+.2f}"),
         ("PSNR human", protocol.human[0], "{:+.2f}"),
@@ -82,7 +82,7 @@ def interval_over_scenes(units: pd.Series) -> ConfidenceInterval | None:
 
 
 def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
-    """Returns the table that compares every variant with the plain variant of its method at the same place."""
+    """Return the table that compares every variant with the plain variant of its method at the same place."""
     shown = [one for one in measures(protocol) if any(variant.mean(one.column) is not None for variant in variants)]
     rows, alone = [], []
     for variant in variants:
@@ -120,19 +120,19 @@ def is_capped(plain: Variant) -> bool:
 
 
 def _named(plain: Variant) -> str:
-    """Returns the name of a plain variant, marked where its count is a limit's."""
+    """Return the name of a plain variant, marked where its count is a limit's."""
     return f"{plain.name} {CAPPED}" if is_capped(plain) else plain.name
 
 
 def _caps(variants: Sequence[Variant]) -> tuple[str, ...]:
-    """Says what a share of a marked variant's Gaussians is a share of."""
+    """Say what a share of a marked variant's Gaussians is a share of."""
     held = [variant.name for variant in variants if variant.sparsify == "none" and is_capped(variant)]
     said = "held down by max_gaussians, so that a share of its Gaussians is a share of that limit"
     return (f"{CAPPED} {', '.join(held)}: {said}",) if held else ()
 
 
 def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs: tuple[str, ...]) -> Cell:
-    """Returns mean and interval, bold if it excludes 0; with its own n if that is not the row's.
+    """Return mean and interval, bold if it excludes 0; with its own n if that is not the row's.
 
     >>> difference_cell(t_interval([-0.3, -0.2, -0.1]), "{:+.2f}", 3, ()).text
     '-0.20 [-0.45, +0.05]'

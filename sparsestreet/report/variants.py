@@ -90,24 +90,24 @@ def repeats(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) -
 
 
 def control_of(run: RunSummary) -> str | None:
-    """Returns the kind of control that a run is, or None. A control only copies the size of another run."""
+    """Return the kind of control that a run is, or None. A control only copies the size of another run."""
     control = run.run.config.get("sparsify.control", _EARLIER_CONTROLS.get(run.run.sparsify))
     return None if control is None else str(control)
 
 
 def log_config(run: RunSummary) -> dict[str, Setting]:
-    """Returns the options that select the log and the images that a run saw."""
+    """Return the options that select the log and the images that a run saw."""
     return only(without(run.run.config, IDENTITY_KEYS), LOG_KEYS)
 
 
 def _compared(run: RunSummary) -> dict[str, Setting]:
-    """Returns the options by which runs of one table may differ."""
+    """Return the options by which runs of one table may differ."""
     follows = COUNT_KEYS if control_of(run) and run.run.config.get("count_of") else ()
     return without(run.run.config, (*IDENTITY_KEYS, *SECTION_KEYS, *follows))
 
 
 def _options(run: RunSummary, others: Iterable[RunSummary]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Returns the options by which a run differs from others of its label, and those of them that its name holds.
+    """Return the options by which a run differs from others of its label, and those of them that its name holds.
 
     If the options that the commands gave distinguish all configurations, choices of groups (``pruning=volume``) among
     them, the name holds those: the rest follows from them. Otherwise it holds all. ``others`` includes the run itself.
@@ -127,7 +127,7 @@ def _options(run: RunSummary, others: Iterable[RunSummary]) -> tuple[tuple[str, 
 
 
 def _chosen(runs: Sequence[RunSummary], identities: Sequence[str]) -> list[tuple[str, ...]]:
-    """Returns for each configuration the choices of groups that its commands gave, and that others did not give.
+    """Return for each configuration the choices of groups that its commands gave, and that others did not give.
 
     A group without a dot in its key is no option of the configuration itself; one that differs between repeats says
     nothing of the configuration.
@@ -161,7 +161,7 @@ def _name(label: str, options: Sequence[str], identity: str) -> str:
 
 
 def in_few_words(options: Sequence[str], identity: str) -> str:
-    """Returns options for a name: the first few, cut to a length, with a hash if there are more.
+    """Return options for a name: the first few, cut to a length, with a hash if there are more.
 
     >>> in_few_words(["split.stride=5", "seed=1"], identity="0123456789ab")
     'split.stride=5, seed=1'
@@ -173,7 +173,7 @@ def in_few_words(options: Sequence[str], identity: str) -> str:
 
 
 def _shortened(word: str) -> str:
-    """Returns an option for a name. The ends of its key and of a class's path tell it apart, so their beginnings go.
+    """Return an option for a name. The ends of its key and of a class's path tell it apart, so their beginnings go.
 
     >>> _shortened("callback.pruning.rule._target_=mypaper.rules.VolumeRule")
     'rule=VolumeRule'
@@ -229,7 +229,7 @@ class Variant:
         return self.label.partition("+")[0]
 
     def runs(self, whole: bool = False) -> dict[Unit, list[RunRecord]]:
-        """Returns scene and seed -> its runs that were trained on all views (``whole``), or the others."""
+        """Return scene and seed -> its runs that were trained on all views (``whole``), or the others."""
         found: dict[Unit, list[RunRecord]] = {}
         for record in self.records:
             if (record.summary.run.split == "none") == whole:
@@ -260,12 +260,12 @@ class Variant:
         return mean_over_scenes(self.units(column, whole))
 
     def busy(self, clock: str) -> str:
-        """Returns the mark of times, of "frames" or of "training", if a machine was not quiet; else an empty text."""
+        """Return the mark of times, of "frames" or of "training", if a machine was not quiet; else an empty text."""
         return "" if all(CLOCKS[clock](record.summary) for record in self.records) else BUSY
 
 
 def busy_variants(found: Iterable[Variant]) -> list[str]:
-    """Returns a note that names the variants with times of a machine that was not quiet, or nothing."""
+    """Return a note that names the variants with times of a machine that was not quiet, or nothing."""
     return busy_note((variant.name, record.summary) for variant in found for record in variant.records)
 
 
@@ -313,7 +313,7 @@ def _lacks(variant: Variant, among: Sequence[Variant]) -> tuple[str, ...]:
 
 
 def incomplete(found: Sequence[Variant]) -> list[str]:
-    """Returns a note on the variants that lack runs which others have, or nothing."""
+    """Return a note on the variants that lack runs which others have, or nothing."""
     lacking = [f"{variant.name} lacks {_few(variant.lacks)}" for variant in found if variant.lacks]
     if not lacking:
         return []
@@ -328,7 +328,7 @@ def _few(words: Sequence[str], most: int = 3) -> str:
 
 
 def plain_of(variant: Variant, among: Iterable[Variant]) -> Variant | None:
-    """Returns the plain variant of the same method at the same place; None if there is none or several."""
+    """Return the plain variant of the same method at the same place; None if there is none or several."""
     plain = [
         other
         for other in among
@@ -338,7 +338,7 @@ def plain_of(variant: Variant, among: Iterable[Variant]) -> Variant | None:
 
 
 def why_apart(found: Sequence[Variant]) -> list[str]:
-    """Returns notes on why some runs of this page are not averaged or compared."""
+    """Return notes on why some runs of this page are not averaged or compared."""
     if not found:
         return []
     said = []
@@ -365,7 +365,7 @@ def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
 
 
 def _logs_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
-    """Returns id of a run -> the options of its log in which runs differ, except which part of the log is read."""
+    """Return id of a run -> the options of its log in which runs differ, except which part of the log is read."""
     logs = {id(record.summary): without(log_config(record.summary), CLIP_KEYS) for record in records}
     distinct = {config_hash(log): log for log in logs.values()}
     words = dict(zip(distinct, differing_options(list(distinct.values())), strict=True))
@@ -373,12 +373,12 @@ def _logs_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
 
 
 def _splits_in_words(records: Sequence[RunRecord]) -> dict[int, str]:
-    """Returns id of a run -> its held-out views in words; empty if all runs that hold views out agree."""
+    """Return id of a run -> its held-out views in words; empty if all runs that hold views out agree."""
     splits = {id(record.summary): record.summary.run.split for record in records}
     return splits if len(set(splits.values()) - {"none"}) > 1 else dict.fromkeys(splits, "")
 
 
 def _edition(run: RunSummary, records: Sequence[RunRecord]) -> str:
-    """Returns the start of the data's hash if runs of the scene have different data; else an empty text."""
+    """Return the start of the data's hash if runs of the scene have different data; else an empty text."""
     alike = {record.summary.run.data_hash for record in records if clip_of(record.summary) == clip_of(run)}
     return f"data {run.run.data_hash[:6]}" if len(alike) > 1 else ""

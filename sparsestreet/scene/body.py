@@ -52,7 +52,7 @@ class BodyTemplate:
         return float(self.vertices[:, 1].amax() - self.vertices[:, 1].amin())
 
     def shaped(self, shape: Float[Tensor, "10"], height: float) -> tuple[Float[Tensor, "v 3"], Float[Tensor, "24 3"]]:
-        """Returns vertices and joints of one person, with the pelvis at the origin.
+        """Return vertices and joints of one person, with the pelvis at the origin.
 
         A template with directions uses the coefficients of ``shape``; any other is scaled to ``height``.
         """
@@ -65,7 +65,7 @@ class BodyTemplate:
         return vertices - joints[0], joints - joints[0]
 
     def influences(self) -> tuple[Int[Tensor, "v k"], Float[Tensor, "v k"]]:
-        """Returns the joints that move each vertex, strongest first, and their weights; k is the most of any vertex."""
+        """Return the joints that move each vertex, strongest first, and their weights; k is the most of any vertex."""
         most = int((self.weights > 0).sum(1).amax())
         parts, joints = self.weights.sort(dim=1, descending=True, stable=True)
         return joints[:, :most].contiguous(), parts[:, :most].contiguous()
@@ -76,13 +76,13 @@ class Body(ABC):
 
     @abstractmethod
     def load(self) -> BodyTemplate:
-        """Returns the template. Raises OSError or ValueError for a file that cannot be read."""
+        """Return the template. Raises OSError or ValueError for a file that cannot be read."""
 
 
 def surface(
     vertices: Float[Tensor, "v 3"], faces: Int[Tensor, "t 3"]
 ) -> tuple[Float[Tensor, " v"], Float[Tensor, "v 3"]]:
-    """Returns a third of the area of the triangles around each vertex, square meters, and its outward unit normal."""
+    """Return a third of the area of the triangles around each vertex, square meters, and its outward unit normal."""
     a, b, c = vertices[faces].unbind(1)
     # Its length is twice the area, so larger triangles count more for the normal.
     across = torch.linalg.cross(b - a, c - a)
@@ -101,7 +101,7 @@ _STEP = 1e-4
 def surface_net(
     field: Field, low: tuple[float, float, float], high: tuple[float, float, float], spacing: float
 ) -> tuple[Float64[np.ndarray, "v 3"], Int64[np.ndarray, "t 3"]]:
-    """Returns vertices on the zeros of a signed distance, and triangles, counterclockwise from the positive side.
+    """Return vertices on the zeros of a signed distance, and triangles, counterclockwise from the positive side.
 
     Surface nets (Gibson, MICCAI 1998) put one vertex in each grid cell that the surface passes through. The four cells
     around each edge that it crosses make a quadrilateral. The field must be positive on the faces of the box.
@@ -133,7 +133,7 @@ def surface_net(
 def _crossings(
     values: Float64[np.ndarray, "x y z"],
 ) -> tuple[Float64[np.ndarray, "e 3"], Int64[np.ndarray, "e 4"], np.ndarray]:
-    """Returns points of sign changes along edges, in units of the grid; the four cells around; whether values grow."""
+    """Return points of sign changes along edges, in units of the grid; the four cells around; whether values grow."""
     strides = np.array([values.shape[1] * values.shape[2], values.shape[2], 1])
     places, cells, grows = [], [], []
     for axis in range(3):
@@ -152,7 +152,7 @@ def _crossings(
 
 
 def _projected(field: Field, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 3"]:
-    """Returns the points after one step of Newton's method along the gradient."""
+    """Return the points after one step of Newton's method along the gradient."""
     value = field(points)
     slope = np.stack([(field(points + step) - value) / _STEP for step in _STEP * np.eye(3)], 1)
     return points - value[:, None] * slope / (slope * slope).sum(1, keepdims=True)
@@ -240,13 +240,13 @@ class _Capsules:
         return _Capsules(joints, starts, ends, radii)
 
     def distances(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, " n"]:
-        """Returns signed distances from the surface, meters, negative inside; exact far from where capsules meet."""
+        """Return signed distances from the surface, meters, negative inside; exact far from where capsules meet."""
         each = self._from_axes(points) - self.radii
         nearest = each.min(1, keepdims=True)
         return nearest[:, 0] - _BLEND * np.log(np.exp((nearest - each) / _BLEND).sum(1))
 
     def weights(self, points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "n 24"]:
-        """Returns weights by the inverse distance from each bone's axis, in radii, to a power."""
+        """Return weights by the inverse distance from each bone's axis, in radii, to a power."""
         hold = (self.radii / self._from_axes(points)) ** _FALLOFF
         weights = np.zeros((len(points), NUM_JOINTS))
         for joint, column in zip(self.joints, hold.T, strict=True):
@@ -273,7 +273,7 @@ class SmplFile(Body):
     path: str
 
     def load(self) -> BodyTemplate:
-        """Returns the template. Raises FileNotFoundError with the remedy, ValueError if the file is no such body."""
+        """Return the template. Raises FileNotFoundError with the remedy, ValueError if the file is no such body."""
         path = Path(self.path)
         if not path.is_file():
             raise FileNotFoundError(
@@ -342,7 +342,7 @@ class People:
 
 
 def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozenset[int], num_frames: int) -> People:
-    """Returns shapes and poses at frames that are not held out; missing poses are interpolated in the box.
+    """Return shapes and poses at frames that are not held out; missing poses are interpolated in the box.
 
     The pelvis stays at one place in a person's box, so that the posed bodies are centered in the box on average.
     (DriveStudio centers each frame's body, so a body rocks to and fro as its limbs reach out.) Every track needs a
@@ -372,7 +372,7 @@ def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozens
 
 
 def trained_poses(track: Track, held_out: frozenset[int]) -> Bool[Tensor, " f"]:
-    """Returns whether each annotated frame has a pose that training may see."""
+    """Return whether each annotated frame has a pose that training may see."""
     trained = torch.tensor([int(frame) not in held_out for frame in track.frames])
     return trained & _body(track).valid
 
@@ -386,7 +386,7 @@ def _body(track: Track) -> BodyPoses:
 
 
 def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
-    """Returns joints at all annotated frames, the first one box_from_body, by slerp between the frames with a pose.
+    """Return joints at all annotated frames, the first one box_from_body, by slerp between the frames with a pose.
 
     Poses are relative to the box, so a person without a pose turns with the box.
     """
@@ -410,7 +410,7 @@ def _posed(
     attached: Int[Tensor, "v k"],
     weights: Float[Tensor, "v k"],
 ) -> Float[Tensor, "v 3"]:
-    """Returns the body's vertices relative to its pelvis, along the axes of its annotated box."""
+    """Return the body's vertices relative to its pelvis, along the axes of its annotated box."""
     still = torch.zeros(len(vertices), 4)
     return skin(vertices, still, Bones(bones.transforms[frame], bones.quaternions[frame]), attached, weights)[0]
 

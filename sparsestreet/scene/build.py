@@ -34,7 +34,7 @@ class Assignment:
 
 
 def assign_tracks(tracks: Sequence[Track], nodes: Mapping[str, NodeSettings]) -> Assignment:
-    """Gives each track to the node that takes it. Raises ValueError naming the nodes if two claim one track."""
+    """Give each track to the node that takes it. Raises ValueError naming the nodes if two claim one track."""
     by_node: dict[str, list[Track]] = {name: [] for name in nodes}
     unclaimed = []
     for track in tracks:

@@ -44,7 +44,7 @@ class RowPlan:
 
     @staticmethod
     def keep(mask: Bool[Tensor, " old"]) -> "RowPlan":
-        """Returns the plan that keeps the rows where ``mask`` is true, in order.
+        """Return the plan that keeps the rows where ``mask`` is true, in order.
 
         >>> RowPlan.keep(torch.tensor([True, False, True])).source.tolist()
         [0, 2]
@@ -88,12 +88,12 @@ class Rows(nn.Module):
         return next(iter(self.columns().values())).shape[0]
 
     def columns(self) -> dict[str, Tensor]:
-        """Returns all parameters and buffers by name."""
+        """Return all parameters and buffers by name."""
         return dict(self.named_parameters(recurse=False)) | dict(self.named_buffers(recurse=False))
 
     @torch.no_grad()
     def resize(self, plan: RowPlan, optimizer: Optimizer | None = None) -> None:
-        """Applies a plan to values, optimizer moments and buffers, and drops gradients.
+        """Apply a plan to values, optimizer moments and buffers, and drops gradients.
 
         Raises ValueError if the plan was made for another number of rows, edits a column in another shape, or if the
         optimizer lacks a trainable column; KeyError if it edits an unknown column. An error changes nothing.
@@ -119,7 +119,7 @@ class Rows(nn.Module):
 
     @torch.no_grad()
     def drop_column(self, name: str, optimizer: Optimizer | None = None) -> None:
-        """Removes a parameter from the table and from the optimizer (the column of a finished mask)."""
+        """Remove a parameter from the table and from the optimizer (the column of a finished mask)."""
         parameter = self.get_parameter(name)
         delattr(self, name)
         if optimizer is not None:
@@ -145,7 +145,7 @@ class Rows(nn.Module):
             raise ValueError(f"the optimizer does not hold the columns {missing}: build it after the scene was loaded")
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        """Takes the number of rows from the checkpoint, and drops transient columns that it lacks.
+        """Take the number of rows from the checkpoint, and drops transient columns that it lacks.
 
         Load before you build an optimizer, because parameters of another length are replaced.
         """
@@ -161,7 +161,7 @@ class Rows(nn.Module):
 
 
 def drop_parameter(optimizer: Optimizer, parameter: Tensor) -> None:
-    """Removes a parameter and its moments from an optimizer; does nothing if the optimizer does not hold it."""
+    """Remove a parameter and its moments from an optimizer; does nothing if the optimizer does not hold it."""
     optimizer.state.pop(parameter, None)
     for group in optimizer.param_groups:
         group["params"] = [other for other in group["params"] if other is not parameter]
@@ -171,7 +171,7 @@ def drop_parameter(optimizer: Optimizer, parameter: Tensor) -> None:
 def _replace_in_optimizer(
     optimizer: Optimizer, old: Tensor, new: nn.Parameter, source: Tensor, zero: Tensor, inherited: Collection[str]
 ) -> None:
-    """Puts ``new`` in the place of ``old`` and carries every per-row moment along, set to 0 where ``zero`` is true,
+    """Put ``new`` in the place of ``old`` and carries every per-row moment along, set to 0 where ``zero`` is true,
     except for those that are ``inherited``."""
     for group in optimizer.param_groups:
         group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
@@ -197,7 +197,7 @@ class Selection:
     removed: int
 
     def plan(self) -> RowPlan:
-        """Returns the plan that keeps these rows in order, with their optimizer moments."""
+        """Return the plan that keeps these rows in order, with their optimizer moments."""
         return RowPlan.keep(self.keep)
 
 
@@ -245,7 +245,7 @@ def keep_best(
 
 
 def _within_floors(ids: Int[Tensor, " n"], least: Int[Tensor, " i"]) -> Bool[Tensor, " n"]:
-    """Returns whether each row is within its instance's floor, counted from the first row; rows come best first."""
+    """Return whether each row is within its instance's floor, counted from the first row; rows come best first."""
     by_instance = torch.sort(ids, stable=True)
     counts = torch.bincount(ids, minlength=len(least))
     place = torch.arange(len(ids), device=ids.device) - (counts.cumsum(0) - counts)[by_instance.values]

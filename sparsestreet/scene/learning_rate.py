@@ -39,7 +39,7 @@ class LearningRate:
         return cls(**said)
 
     def factor(self, progress: float) -> float:
-        """Returns the multiplier of the initial rate at a progress in [0, 1]."""
+        """Return the multiplier of the initial rate at a progress in [0, 1]."""
         if progress < self.start:
             return 0.0
         if self.final is None:
@@ -52,7 +52,7 @@ Rates = Mapping[str, LearningRate | Mapping[str, Any]]
 
 
 def rates_of(said: Rates) -> dict[str, LearningRate]:
-    """Returns every rate as a ``LearningRate``. Raises ValueError for anything else.
+    """Return every rate as a ``LearningRate``. Raises ValueError for anything else.
 
     >>> rates_of({"means": {"initial": 0.01}})["means"].initial
     0.01
@@ -90,7 +90,7 @@ def usual_track_rates() -> dict[str, LearningRate]:
 
 
 def matching_rate(name: str, rates: Rates, where: str) -> LearningRate:
-    """Returns the rate of a parameter by its dotted name.
+    """Return the rate of a parameter by its dotted name.
 
     A key matches if the name contains its words in a row. It can be a column (``means`` in ``rows.means``) or a module
     (``mlp`` in ``mlp.0.weight``). The longest key wins. Raises ValueError, naming ``where`` to add one, for a parameter

@@ -33,7 +33,7 @@ _Settings = TypeVar("_Settings")
 
 
 def encode(value: Any) -> Any:
-    """Returns plain values, lists, mappings and frozen dataclasses as strict JSON; floats keep every bit.
+    """Return plain values, lists, mappings and frozen dataclasses as strict JSON; floats keep every bit.
 
     Raises TypeError, naming the type, for anything else, ValueError for a mapping with the key ``class``.
 
@@ -57,7 +57,7 @@ def encode(value: Any) -> Any:
 
 
 def decode(value: Any) -> Any:
-    """Returns what ``encode`` was given, tuples as lists. Raises ValueError for an unknown or unsuitable class.
+    """Return what ``encode`` was given, tuples as lists. Raises ValueError for an unknown or unsuitable class.
 
     >>> from sparsestreet.scene.learning_rate import LearningRate
     >>> decode(encode(LearningRate(0.01))) == LearningRate(0.01)
@@ -80,7 +80,7 @@ def decode(value: Any) -> Any:
 
 
 def decode_as(kind: type[_Settings], value: Any) -> _Settings:
-    """Returns what ``encode`` was given. Raises TypeError if it is not a ``kind``."""
+    """Return what ``encode`` was given. Raises TypeError if it is not a ``kind``."""
     decoded = decode(value)
     if not isinstance(decoded, kind):
         raise TypeError(f"a {type(decoded).__name__} stands where a {kind.__name__} belongs")

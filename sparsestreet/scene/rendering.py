@@ -40,7 +40,7 @@ BACKGROUND_COLOR = 0.05
 
 
 def node_legend(nodes: Iterable[str]) -> dict[str, tuple[int, int, int]]:
-    """Returns name of a node, in the order of the scene -> 8-bit RGB of its dots.
+    """Return name of a node, in the order of the scene -> 8-bit RGB of its dots.
 
     >>> node_legend(["background"])
     {'background': (76, 153, 230)}
@@ -54,7 +54,7 @@ def _rgb8(red: float, green: float, blue: float) -> tuple[int, int, int]:
 
 @torch.no_grad()
 def project_centers(scene: SceneGraph, view: View, *, min_opacity: float = 0.005) -> Float[Tensor, "h w 3"]:
-    """Returns an image in [0, 1] with one pixel per center in view, the nearest center on top.
+    """Return an image in [0, 1] with one pixel per center in view, the nearest center on top.
 
     It omits rows below ``min_opacity``: those of absent instances, masked ones, and those about to be culled.
     """
@@ -75,7 +75,7 @@ def project_centers(scene: SceneGraph, view: View, *, min_opacity: float = 0.005
 def _nearest_per_pixel(
     pixels: Int[Tensor, " n"], depth: Float[Tensor, " n"], num_pixels: int
 ) -> tuple[Int[Tensor, " p"], Int[Tensor, " p"]]:
-    """Returns the pixels that are hit, and for each the point with the smallest depth."""
+    """Return the pixels that are hit, and for each the point with the smallest depth."""
     order = depth.argsort(stable=True)
     rank = torch.empty_like(order)
     rank[order] = torch.arange(order.shape[0], device=order.device)

@@ -44,7 +44,7 @@ _ELLIPSOIDS = (Background, Rigid, Smpl, Vibrating)
 
 
 def form_of(node: Node, axes: Mapping[int, Int16[np.ndarray, "d d"]]) -> Form:
-    """Returns how the node's rows are packed, with principal axes by the number of harmonics."""
+    """Return how the node's rows are packed, with principal axes by the number of harmonics."""
     size = 3 * (1 + node.rows.sh_rest.shape[1])
     others = {
         name: OtherColumn(str(column.dtype).removeprefix("torch."), tuple(column.shape[1:]), _step(node, name))
@@ -55,7 +55,7 @@ def form_of(node: Node, axes: Mapping[int, Int16[np.ndarray, "d d"]]) -> Form:
 
 
 def packed_blocks(node: Node, form: Form) -> Iterator[list[bytes]]:
-    """Yields the node's rows, all of them finite: object by object, along a curve through each."""
+    """Yield the node's rows, all of them finite: object by object, along a curve through each."""
     columns = {name: column.detach().cpu() for name, column in node.rows.columns().items()}
     means = columns["means"].double().numpy()
     order = curve_order(means)
@@ -72,7 +72,7 @@ def packed_blocks(node: Node, form: Form) -> Iterator[list[bytes]]:
 
 
 def columns_of(block: Block, form: Form) -> dict[str, Tensor]:
-    """Returns the columns of a block, float32 as they are learned."""
+    """Return the columns of a block, float32 as they are learned."""
     colors = torch.from_numpy(block.harmonics).float().reshape(len(block), len(form.axes) // 3, 3)
     return {
         "means": torch.from_numpy(block.means).float(),
@@ -86,7 +86,7 @@ def columns_of(block: Block, form: Form) -> dict[str, Tensor]:
 
 
 def joined(blocks: list[dict[str, Tensor]], form: Form) -> dict[str, Tensor]:
-    """Returns the columns of all blocks, and empties them; those of a table without rows where there is none."""
+    """Return the columns of all blocks, and empties them; those of a table without rows where there is none."""
     if not blocks:
         none = {name: np.zeros((0, *column.shape), column.dtype) for name, column in form.others.items()}
         empty = Block(
@@ -97,7 +97,7 @@ def joined(blocks: list[dict[str, Tensor]], form: Form) -> dict[str, Tensor]:
 
 
 def second_moments(nodes: Sequence[Node]) -> dict[int, Float64[np.ndarray, "d d"]]:
-    """Returns the second moments of all harmonics, weighted by opacity, by the number of harmonics of a row."""
+    """Return the second moments of all harmonics, weighted by opacity, by the number of harmonics of a row."""
     sums: dict[int, Float64[np.ndarray, "d d"]] = {}
     for node in nodes:
         size = 3 * (1 + node.rows.sh_rest.shape[1])
@@ -112,13 +112,13 @@ def second_moments(nodes: Sequence[Node]) -> dict[int, Float64[np.ndarray, "d d"
 
 
 def form_header(form: Form) -> dict[str, Any]:
-    """Returns what a file says of a form, but for its axes."""
+    """Return what a file says of a form, but for its axes."""
     others = {name: [column.dtype, list(column.shape), column.step] for name, column in form.others.items()}
     return {"harmonics": len(form.axes), "named_axes": form.named_axes, "others": others}
 
 
 def form_from(header: Mapping[str, Any], axes: Mapping[int, Int16[np.ndarray, "d d"]]) -> Form:
-    """Returns the form that ``form_header`` described."""
+    """Return the form that ``form_header`` described."""
     others = {
         name: OtherColumn(dtype, tuple(map(int, shape)), step)
         for name, (dtype, shape, step) in header["others"].items()
@@ -127,7 +127,7 @@ def form_from(header: Mapping[str, Any], axes: Mapping[int, Int16[np.ndarray, "d
 
 
 def row_bytes(form: Form) -> int:
-    """Returns the bytes of a row once it is unpacked, before it is put into a table and after."""
+    """Return the bytes of a row once it is unpacked, before it is put into a table and after."""
     return 16 * (11 + len(form.axes)) + sum(16 * math.prod(column.shape) for column in form.others.values())
 
 
@@ -149,7 +149,7 @@ def _position_step(columns: Mapping[str, Tensor], rows: Int64[np.ndarray, " n"])
 
 
 def _step(node: Node, name: str) -> float | None:
-    """Returns the step of a column that only some nodes have; None: it is kept bit for bit."""
+    """Return the step of a column that only some nodes have; None: it is kept bit for bit."""
     if not isinstance(node, Vibrating) or not len(node.rows):
         return None
     if name == "velocities":
@@ -309,7 +309,7 @@ def _count(value: Any) -> int:
 
 @contextmanager
 def _naming(path: Path):
-    """Turns whatever a damaged file causes into one sentence with its name."""
+    """Turn whatever a damaged file causes into one sentence with its name."""
     try:
         yield
     except ValueError as error:

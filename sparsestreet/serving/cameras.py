@@ -223,7 +223,7 @@ def _distortion(param: Any, name: str) -> torch.Tensor | None:
 
 @lru_cache(maxsize=64)
 def _check_invertible(intrinsics: tuple[float, ...], distortion: tuple[float, ...], size: tuple[int, int]) -> None:
-    """Raises ValueError for a lens that images nothing in parts of its image."""
+    """Raise ValueError for a lens that images nothing in parts of its image."""
     largest_shift(torch.tensor(intrinsics).reshape(3, 3), torch.tensor(distortion), *size)
 
 
@@ -290,7 +290,7 @@ class Rig:
         return _interpolated(self.times, self.poses, time)
 
     def camera(self, name: str) -> RigCamera:
-        """Raises ValueError for a name that no camera has."""
+        """Raise ValueError for a name that no camera has."""
         for one in self.cameras:
             if one.name == name:
                 return one

@@ -74,7 +74,7 @@ def run_rig(run: Path, options: RigOptions) -> Rig:
 
 
 def named_runs(runs: Sequence[Path]) -> dict[str, Path]:
-    """Names for runs: that of the log, or of the folder where several runs are of one log.
+    """Name for runs: that of the log, or of the folder where several runs are of one log.
 
     Raises FileNotFoundError for a folder without a scene, ValueError for two runs of one name.
     """
@@ -126,7 +126,7 @@ class Scenes:
 
     @property
     def opened(self) -> list[str]:
-        """Names of the scenes in memory, the one asked for longest ago first."""
+        """Name of the scenes in memory, the one asked for longest ago first."""
         with self._changing:
             return list(self._opened)
 

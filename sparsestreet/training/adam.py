@@ -25,7 +25,7 @@ class RefusedRows:
 
     @staticmethod
     def of(groups: Iterable[Mapping[str, Any]]) -> "RefusedRows":
-        """Counts of zero for the parameters that have a gradient."""
+        """Count of zero for the parameters that have a gradient."""
         held = [(one, group) for group in groups for one in group["params"] if one.grad is not None]
         device = held[0][0].device if held else torch.device("cpu")
         counts = torch.zeros(len(held), 2, dtype=torch.int64, device=device)

@@ -131,7 +131,7 @@ def measured_evaluation(system: StreetSystem, data: StreetData) -> tuple[float, 
 
 
 def renders_of(timing: Timing, cameras: int, parts: int) -> int:
-    """Renders of ``evaluation.speed``: a splat, a frame and a rig each time, then rounds with and without each part."""
+    """Render of ``evaluation.speed``: a splat, a frame and a rig each time, then rounds with and without each part."""
     return timing.warmup + timing.repeats * (2 + cameras) + timing.rounds * 2 * parts
 
 

@@ -71,7 +71,7 @@ def ends_step(trainer: Trainer, batch_idx: int) -> bool:
 
 
 def check_images(trainer: Trainer, images: int) -> None:
-    """Raises ValueError where a step would take more images than there are to train on."""
+    """Raise ValueError where a step would take more images than there are to train on."""
     if images_per_step(trainer) > max(images, 1):
         raise ValueError(
             f"a step takes {images_per_step(trainer)} images, of {trainer.world_size} processes and "
@@ -80,7 +80,7 @@ def check_images(trainer: Trainer, images: int) -> None:
 
 
 def steps_for(trainer: Trainer, images: int) -> int:
-    """Steps in which a trainer sees so many images."""
+    """Step in which a trainer sees so many images."""
     return -(-images // images_per_step(trainer))
 
 

@@ -56,7 +56,7 @@ class Photometric:
 
 
 def without_hood(rendering: SceneRendering, frame: Frame) -> tuple[SceneRendering, Frame]:
-    """Returns both as losses see them: on the pixels of ``ego`` black, without alpha, and without depth.
+    """Return both as losses see them: on the pixels of ``ego`` black, without alpha, and without depth.
 
     There both images agree, alpha is that of a sky, and nothing has a gradient. Means stay those over all pixels, as in
     DriveStudio. A frame without such a mask and its rendering are returned as they are.

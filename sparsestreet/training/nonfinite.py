@@ -68,7 +68,7 @@ class LossWatch:
 
 
 def check_parameters(named: Iterable[tuple[str, Tensor]], step: int) -> None:
-    """Raises NotFiniteError, naming node, column and row, where a parameter is not finite: no checkpoint has such."""
+    """Raise NotFiniteError, naming node, column and row, where a parameter is not finite: no checkpoint has such."""
     if places := not_finite(named):
         raise NotFiniteError(
             f"after step {step} parameters are not finite: {', '.join(places)}. The newest checkpoint is from before: "

@@ -89,7 +89,7 @@ class Recipe:
         return [f"at or below K_min, where masks and pruning take nothing: {', '.join(said)}; {remedy}"] if said else []
 
     def check(self) -> None:
-        """Raises ValueError where there are ``problems``."""
+        """Raise ValueError where there are ``problems``."""
         if found := self.problems():
             raise ValueError("; ".join(found))
 

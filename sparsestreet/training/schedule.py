@@ -151,12 +151,12 @@ class ResolutionSchedule:
             )
 
     def divisor(self, step: int, course: Course) -> int:
-        """Returns by what the sides of the images of a step (0 is the first) are divided."""
+        """Return by what the sides of the images of a step (0 is the first) are divided."""
         doubled = int(course.progress(step) / self.double_in + ROUNDING)
         return 2 ** max(self.halvings - doubled, 0)
 
     def of(self, frame: Frame, step: int, course: Course) -> Frame:
-        """Returns the frame as a step trains on it; whole, it is the same object."""
+        """Return the frame as a step trains on it; whole, it is the same object."""
         if not self.halvings:
             return frame
         side = min(frame.camera.width, frame.camera.height)
@@ -165,7 +165,7 @@ class ResolutionSchedule:
 
 
 def smaller(frame: Frame, divisor: int) -> Frame:
-    """Returns the frame with sides of a ``divisor``-th, rounded down to whole pixels.
+    """Return the frame with sides of a ``divisor``-th, rounded down to whole pixels.
 
     Images are resized by an antialiased bicubic filter, masks take the nearest pixel, a depth is the mean of the
     returns in its part of the image.

@@ -36,7 +36,7 @@ class Features:
 
 
 def find_features(image: UInt8[np.ndarray, "h w 3"], limit: int) -> Features:
-    """Returns at most ``limit`` features, those of the strongest contrast."""
+    """Return at most ``limit`` features, those of the strongest contrast."""
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     zoom = 2 if gray.shape[1] < SIFT_WIDTH else 1
     if zoom > 1:
@@ -76,7 +76,7 @@ def guided_matches(
     tolerance: float,
     ratio: float,
 ) -> Int[np.ndarray, "k 2"]:
-    """Returns the rows of features that match each other best along the epipolar line and in front of both cameras.
+    """Return the rows of features that match each other best along the epipolar line and in front of both cameras.
 
     Args:
         first, second: features of either image.

@@ -207,7 +207,7 @@ def triangulate(
     settings: ImagePointSettings,
     progress: Callable[[int, int], None] | None = None,
 ) -> TriangulatedPoints:
-    """Returns the points on which the views agree; none if the cameras stand still.
+    """Return the points on which the views agree; none if the cameras stand still.
 
     ``progress`` is called with the number of compared pairs of images, and of all pairs.
     """

@@ -40,7 +40,7 @@ class StreetPoints:
 
 
 def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
-    """Finds points in images; each image is decoded once.
+    """Find points in images; each image is decoded once.
 
     Args:
         frames: training views.
@@ -68,7 +68,7 @@ def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointS
 
 
 def _report(done: int, total: int) -> None:
-    """Logs a line whenever another quarter of the pairs is compared."""
+    """Log a line whenever another quarter of the pairs is compared."""
     if done * 4 // total > (done - 1) * 4 // total:
         log.info("points from images: %d of %d pairs compared", done, total)
 
@@ -162,7 +162,7 @@ _COLUMNS = ("positions", "colors", "pixel_sizes", "observed", "views", "pixels")
 
 
 def cached_street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
-    """Returns ``street_points``, from the cache if the same images, poses, boxes and settings made them before.
+    """Return ``street_points``, from the cache if the same images, poses, boxes and settings made them before.
 
     Raises OSError before any work if the cache cannot be written.
     """

@@ -53,7 +53,7 @@ class Pace:
 
 
 def fitted(width: int, height: int, pixels: float) -> tuple[int, int]:
-    """Returns a size in the same proportions with at most so many pixels.
+    """Return a size in the same proportions with at most so many pixels.
 
     >>> fitted(200, 100, 1e6), fitted(200, 100, 5000.0)
     ((200, 100), (100, 50))

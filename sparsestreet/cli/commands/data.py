@@ -101,7 +101,7 @@ def _source(name: str, reader: LogReader, cfg: DictConfig) -> Source:
 
 
 def _sorted(arguments: Sequence[str]) -> _Words:
-    """Raises UsageError for words that are given twice or not at all."""
+    """Raise UsageError for words that are given twice or not at all."""
     given: dict[str, Path] = {}
     settings, log = [], []
     for text in arguments:

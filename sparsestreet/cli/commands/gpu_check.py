@@ -138,7 +138,7 @@ def memory() -> str:
 
 
 def splat() -> str:
-    """Draws and differentiates a small scene on the device and, in float64, on the CPU."""
+    """Draw and differentiate a small scene on the device and, in float64, on the CPU."""
     import torch
 
     from sparsestreet.bench.accuracy import agrees, answer, errors

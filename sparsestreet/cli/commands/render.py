@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def lidar_of_run(run: Path, views: "RecordedViews", parts: Sequence[str] = ()) -> "LidarReturns":
-    """Returns the sweeps at the times of their frames, in the world of the scene; ``parts`` as for ``open_scene``.
+    """Return the sweeps at the times of their frames, in the world of the scene; ``parts`` as for ``open_scene``.
 
     Raises ValueError in one sentence where the log is not there, is another one, or has no lidar.
     """

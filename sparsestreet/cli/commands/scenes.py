@@ -65,7 +65,7 @@ def with_edits(stored: StoredScene, views: RecordedViews, file: Path | None) -> 
 
 
 def opener(stored: StoredScene) -> Open:
-    """Opens other scenes on the device of a scene, each once: Gaussians and the seconds of its log."""
+    """Open other scenes on the device of a scene, each once: Gaussians and the seconds of its log."""
 
     @cache
     def open_scene(path: Path) -> tuple[StoredScene, float]:

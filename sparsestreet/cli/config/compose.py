@@ -213,7 +213,7 @@ def is_sweep(text: str) -> bool:
 
 
 def check_moved(cfg: DictConfig) -> None:
-    """Raises ValueError for a key that an earlier version wrote, and that has another name now."""
+    """Raise ValueError for a key that an earlier version wrote, and that has another name now."""
     for old, new in MOVED.items():
         place, _, name = old.rpartition(".")
         if name in (OmegaConf.select(cfg, place) or {}):

@@ -165,5 +165,5 @@ def compose_data(overrides: Sequence[str]) -> DictConfig:
 
 
 def reader_of(cfg: DictConfig) -> "LogReader":
-    """Raises what the reader's class raises for its values, as ``made`` does."""
+    """Raise what the reader's class raises for its values, as ``made`` does."""
     return made(cfg.data.log)

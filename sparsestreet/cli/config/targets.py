@@ -50,7 +50,7 @@ class ClosedList:
 
 @cache
 def named_by_conf() -> ClosedList:
-    """Returns the closed list. It leaves out ``hydra``, which is no part of a run."""
+    """Return the closed list. It leaves out ``hydra``, which is no part of a run."""
     targets: dict[str, set[str]] = {}
     values, texts = set(), set()
     for name, anywhere, tree in config_files():
@@ -75,7 +75,7 @@ def named_by_conf() -> ClosedList:
 
 
 def leaves(tree: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
-    """Yields every plain value with its place, in mappings and lists however deep."""
+    """Yield every plain value with its place, in mappings and list however deep."""
     items = tree.items() if isinstance(tree, Mapping) else enumerate(tree) if isinstance(tree, list | tuple) else None
     if items is None or (not tree and place):
         yield place, tree
@@ -88,7 +88,7 @@ def leaves(tree: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
 
 
 def open_run_config(run: Path, parts: Sequence[str] = ()) -> DictConfig:
-    """Returns the configuration of a run whose parts are to be made: none was made or imported yet.
+    """Return the configuration of a run whose parts are to be made: none was made or imported yet.
 
     ``parts`` are modules that the user's own command trusts: those that it names are imported.
 
@@ -107,7 +107,7 @@ def open_run_config(run: Path, parts: Sequence[str] = ()) -> DictConfig:
 def check_received(
     tree: object, source: Path, parts: Sequence[str] = (), own: frozenset[tuple[Place, str]] = frozenset()
 ) -> None:
-    """Raises ValueError, in one line, where a configuration that came with a run names what conf/ does not.
+    """Raise ValueError, in one line, where a configuration that came with a run names what conf/ does not.
 
     Args:
         tree: plain values, interpolations as they are written.
@@ -123,7 +123,7 @@ def check_received(
 
 
 def check_places(tree: object, source: Path, own: frozenset[tuple[Place, str]]) -> None:
-    """Raises ValueError where a run that goes on would write to, or call, another place than conf/ says."""
+    """Raise ValueError where a run that goes on would write to, or call, another place than conf/ says."""
     known = named_by_conf().values
     names = {place[1] for place, _ in known if place[0] == "trainer" and len(place) > 1}
     for place, value in leaves(tree):
@@ -148,14 +148,14 @@ def trusted(target: str, parts: Iterable[str]) -> bool:
 
 
 def check_modules(parts: Sequence[str]) -> None:
-    """Raises ValueError for what ``parts=[...]`` cannot name."""
+    """Raise ValueError for what ``parts=[...]`` cannot name."""
     for part in parts:
         if not re.fullmatch(r"[^\W\d]\w*(\.[^\W\d]\w*)*", part):
             raise ValueError(f"parts=[...] names modules, such as parts=[mypaper], got {part!r}")
 
 
 def located(target: str, key: str) -> Any:
-    """Returns what a ``_target_`` names. Raises ValueError, naming the key in one line, where it cannot be imported."""
+    """Return what a ``_target_`` names. Raises ValueError, naming the key in one line, where it cannot be imported."""
     try:
         return _locate(target)
     except ImportError as error:
@@ -167,7 +167,7 @@ def located(target: str, key: str) -> Any:
 
 
 def made(part: Any) -> Any:
-    """Returns what a configuration describes. Raises what its class raises, else ValueError in one line."""
+    """Return what a configuration describes. Raises what its class raises, else ValueError in one line."""
     try:
         return instantiate(part, _convert_="all")
     except InstantiationException as error:

@@ -509,7 +509,7 @@ def _written(text: str) -> list[str]:
 
 
 def _default_effects() -> list[str]:
-    """Names in the list of conf/train.yaml."""
+    """Name in the list of conf/train.yaml."""
     defaults = OmegaConf.load(CONF / "train.yaml").defaults
     return next(list(entry.effects) for entry in defaults if "effects" in entry)
 

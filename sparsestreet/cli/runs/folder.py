@@ -72,7 +72,7 @@ def resumed_overrides(arguments: list[str], parts: Sequence[str] = ()) -> list[s
 
 
 def _check_words(received: list[str], typed: list[str], source: Path, parts: Sequence[str]) -> None:
-    """Raises ValueError where words that came with a run choose what only the user's own may."""
+    """Raise ValueError where words that came with a run choose what only the user's own may."""
     check_modules(parts)
     for text in received:
         if text.startswith("-") or "hydra" in text.partition("=")[0] or _key_of(text) == "folder":
@@ -353,7 +353,7 @@ def identity_of_trunk(config: Configuration) -> tuple[str, ...]:
 
 
 def check_resumed(config: dict[str, Any], start: Path) -> None:
-    """Raises ValueError, naming the options, where a run would go on with another configuration than its own.
+    """Raise ValueError, naming the options, where a run would go on with another configuration than its own.
 
     From a checkpoint that was kept before a moment, another folder may prune otherwise from there on.
     """

@@ -449,7 +449,7 @@ class Argoverse2Reader(RecordedReader):
 
 
 def _check_covered(chosen: Selection, path: PosePath) -> None:
-    """Raises LogError where the path of the vehicle begins after, or ends before, an image or a sweep that is read."""
+    """Raise LogError where the path of the vehicle begins after, or ends before, an image or a sweep that is read."""
     stamps = [one for images in chosen.images.values() for one in images if one is not None]
     for stamp in sorted((*stamps, *chosen.instants)):
         if not int(path.stamps[0]) <= stamp <= int(path.stamps[-1]):

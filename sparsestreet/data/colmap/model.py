@@ -53,7 +53,7 @@ MODELS = (
 
 
 def lens_of(model: CameraModel, values: Sequence[float], path: Path, camera: int) -> Lens:
-    """Raises LogError for a model that is not read, and numbers that are no lens."""
+    """Raise LogError for a model that is not read, and numbers that are no lens."""
     if model.lens is None:
         message = f"camera {camera} is a {model.name}, a lens that is not read"
         raise fault(path, message, "run COLMAP's image_undistorter, and read its images and model")

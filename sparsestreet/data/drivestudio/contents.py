@@ -280,7 +280,7 @@ _REMEDY = "drop these returns, and make sure that the rows have the flavor's col
 
 
 def check_sweep_size(layout: Layout, frame: int) -> None:
-    """Raises LogError unless the file holds whole rows."""
+    """Raise LogError unless the file holds whole rows."""
     path, columns = layout.sweep(frame), layout.flavor.columns
     if path.stat().st_size % (4 * columns):
         message = f"{path.stat().st_size} bytes are no whole number of rows of {columns} float32"

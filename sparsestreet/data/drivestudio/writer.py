@@ -60,7 +60,7 @@ class MaskKinds:
 
 @lru_cache(maxsize=1)
 def find_masks(frames: Frames) -> MaskKinds:
-    """Decodes images until no more kind can be in all of them: a few of a log without masks, else all."""
+    """Decode images until no more kind can be in all of them: a few of a log without masks, else all."""
     lacking: dict[str, tuple[int, int]] = {}
     for frame in frames:
         for kind in KINDS:
@@ -330,7 +330,7 @@ def stand_ins(log: DrivingLog, where: Placement) -> tuple[int, ...]:
 
 
 def check_cameras(log: DrivingLog) -> None:
-    """Raises ValueError unless each instant has an image of each camera, whose calibration stays."""
+    """Raise ValueError unless each instant has an image of each camera, whose calibration stays."""
     names = log.camera_names or tuple(map(str, range(log.num_cameras)))
     there = {view.indices for view in log.views}
     wanted = [(frame, camera) for frame in range(log.num_frames) for camera in range(log.num_cameras)]

@@ -252,7 +252,7 @@ def at_frames(stamps: Sequence[int | None], frames: range) -> list[int | None]:
 
 
 def increasing(stamps: Sequence[int | None], frames: Sequence[int], path: Path) -> tuple[int, ...]:
-    """Raises LogError unless each frame has a stamp, later than the one before."""
+    """Raise LogError unless each frame has a stamp, later than the one before."""
     found: list[int] = []
     for frame, stamp in zip(frames, stamps, strict=True):
         if stamp is None:
@@ -344,7 +344,7 @@ def rectifying_rotation(table: Mapping[str, str], number: str, path: Path) -> Fl
 def rigid(
     rotation: Float64[np.ndarray, "3 3"], translation: Float64[np.ndarray, "3"], path: Path, what: str
 ) -> Float64[Tensor, "4 4"]:
-    """Raises LogError unless the rotation is one."""
+    """Raise LogError unless the rotation is one."""
     transform = torch.eye(4, dtype=torch.float64)
     transform[:3, :3], transform[:3, 3] = torch.from_numpy(rotation), torch.from_numpy(translation)
     check_rigid(transform, path, what)
@@ -427,7 +427,7 @@ class Pixels:
 
 
 def check_size(path: Path, size: tuple[int, int]) -> None:
-    """Raises LogError unless the header says this (width, height); nothing is decoded."""
+    """Raise LogError unless the header says this (width, height); nothing is decoded."""
     found = image_size(path)
     if found != size:
         message = "the image is {}x{}, its calibration is for {}x{}".format(*found, *size)

@@ -278,7 +278,7 @@ class KittiReader(RecordedReader):
         return find_drive(self.folder, self.drive, self.cameras, self.first_frame, self.last_frame)
 
     def _parts(self) -> _Parts:
-        """Raises LogError with all that is wrong in the drive's tables."""
+        """Raise LogError with all that is wrong in the drive's tables."""
         drive = self._drive()
         images = [drive.image(camera, frame) for camera, frame in product(drive.cameras, drive.frames)]
         problems = missing_files([*images, *map(drive.oxts, drive.frames)])

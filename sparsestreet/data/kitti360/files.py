@@ -182,12 +182,12 @@ def read_poses(path: Path) -> dict[int, Float64[Tensor, "4 4"]]:
 
 
 def check_pose(pose: Float64[Tensor, "4 4"], frame: int, path: Path) -> None:
-    """Raises LogError unless the pose is rigid."""
+    """Raise LogError unless the pose is rigid."""
     check_rigid(pose, path, f"the pose of frame {frame}")
 
 
 def read_calibration(folder: Path, cameras: Sequence[str]) -> Calibration360:
-    """Raises LogError with all that is wrong in the files.
+    """Raise LogError with all that is wrong in the files.
 
     imu_from_camera = cam_to_pose R_rect^-1: the files place the cameras as they are before rectification. Fisheyes stay
     as they are.

@@ -148,7 +148,7 @@ class Kitti360Reader(RecordedReader):
         return frames
 
     def _parts(self) -> _Parts:
-        """Raises LogError with all that is wrong in the sequence's tables."""
+        """Raise LogError with all that is wrong in the sequence's tables."""
         sequence = self._sequence()
         poses = read_poses(sequence.poses)
         frames = self._window(sequence, poses)

@@ -51,7 +51,7 @@ class Transforms:
 
 
 def read_transforms(path: Path, *, skip: bool = False) -> Transforms:
-    """Raises LogError with every frame at fault. ``skip``: frames without the file of their image are left out."""
+    """Raise LogError with every frame at fault. ``skip``: frames without the file of their image are left out."""
     top = read_json(path)
     listed = top["frames"].items()
     if not listed:

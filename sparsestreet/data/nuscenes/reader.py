@@ -130,7 +130,7 @@ class ScenePixels:
 
 
 def check_size(path: Path, size: tuple[int, int]) -> None:
-    """Raises LogError unless the image has the size that the tables say."""
+    """Raise LogError unless the image has the size that the tables say."""
     found = image_size(path)
     if found != size:
         message = f"the image is {found[0]}x{found[1]}, sample_data.json says {size[0]}x{size[1]}"
@@ -147,7 +147,7 @@ _REMEDY = "extract the file again from the data set's archive, or read the log w
 
 
 def check_sweep_size(path: Path) -> None:
-    """Raises LogError unless the file holds whole rows, of a number that a sweep can have."""
+    """Raise LogError unless the file holds whole rows, of a number that a sweep can have."""
     try:
         size = path.stat().st_size
     except OSError as error:

@@ -288,7 +288,7 @@ def select(
     first_frame: int,
     last_frame: int,
 ) -> Selection:
-    """Finds the scene and reads what its tables say. Raises LogError for tables that are broken, ValueError for a
+    """Find the scene and read what its tables say. Raises LogError for tables that are broken, ValueError for a
     scene, frames or cameras that are not there."""
     tables = find_tables(root, version)
     row, choice = find_scene(tables, scene)

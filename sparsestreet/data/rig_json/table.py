@@ -95,7 +95,7 @@ class RigTable:
 
 
 def read_table(path: Path) -> RigTable:
-    """Raises LogError for the first thing that cannot be."""
+    """Raise LogError for the first thing that cannot be."""
     top = read_json(path).only("cameras", "lidar", "frames", "boxes", "comment")
     cameras = {name: _camera(name, value) for name, value in top["cameras"].entries()}
     if not cameras:

@@ -38,7 +38,7 @@ _EXPOSURE = 0.62
 def radiance(
     scene: Scene, view: SunView, weather: Weather, rays: Rays, hits: Hits, pixel_angle: float
 ) -> Float32[np.ndarray, "3 h w"]:
-    """Returns linear RGB of every ray. ``pixel_angle`` is the angle between neighboring rays, radians."""
+    """Return linear RGB of every ray. ``pixel_angle`` is the angle between neighboring rays, radians."""
     directions = rays.directions.reshape(3, -1)
     parts, distances = hits.parts.ravel(), hits.distances.ravel()
     colors = np.empty(directions.shape, np.float32)
@@ -67,7 +67,7 @@ def _shade(
     distances: Scalars,
     pixel_angle: float,
 ) -> Vectors:
-    """Returns the light from the points of one part towards the viewer."""
+    """Return the light from the points of one part towards the viewer."""
     points = origin[:, None] + distances * directions
     part = scene.parts[index]
     local_directions, local_points = scene.turn_to_part(index, directions), scene.to_part(index, points)
@@ -82,7 +82,7 @@ def _shade(
 
 
 def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vectors:
-    """Returns the extents, along the axes, of the area that a pixel covers on a plane.
+    """Return the extents, along the axes, of the area that a pixel covers on a plane.
 
     A cone of width r around direction d covers r |a - n (d.a) / (d.n)| along an axis a of the plane with normal n. This
     is the gradient of the hit point's coordinate with respect to the ray.
@@ -94,7 +94,7 @@ def _footprints(directions: Vectors, normals: Vectors, radius: Scalars) -> Vecto
 
 
 def mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Scalars, lit: np.ndarray) -> Vectors:
-    """Returns sky and sun mirrored in glossy surfaces (Schlick's Fresnel term); below roofs, the street's far side."""
+    """Return sky and sun mirrored in glossy surfaces (Schlick's Fresnel term); below roofs, the street's far side."""
     colors = np.zeros_like(directions)
     shiny = np.flatnonzero(gloss > 0.01)
     if len(shiny) == 0:
@@ -114,7 +114,7 @@ def mirrored(weather: Weather, directions: Vectors, normals: Vectors, gloss: Sca
 def to_srgb(
     linear: Float32[np.ndarray, "3 h w"], gains: Float32[np.ndarray, "3"] | None = None
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Returns 8-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping.
+    """Return 8-bit sRGB (IEC 61966-2-1) after a shoulder that keeps bright walls from clipping.
 
     ``gains`` multiply the stored values of red, green and blue, before these are rounded and cut off at white.
     """
@@ -150,13 +150,13 @@ class StreetCamera:
     """Brown-Conrady k1, k2, p1, p2, k3; empty: a pinhole."""
 
     def rays(self, supersampling: int, window: Window = EVERYWHERE) -> Rays:
-        """Returns supersampling x supersampling evenly spread rays per pixel; a single ray goes through its center."""
+        """Return supersampling x supersampling evenly spread rays per pixel; a single ray goes through its center."""
         local = self._directions(supersampling, window)
         world = np.einsum("ij,jhw->ihw", self.world_from_camera[:3, :3], local)
         return Rays(self.world_from_camera[:3, 3].astype(np.float32), np.ascontiguousarray(world, np.float32))
 
     def axis_cosines(self, window: Window = EVERYWHERE) -> Float64[np.ndarray, "h w"]:
-        """Returns the depth along the optical axis per meter along the ray through each pixel's center."""
+        """Return the depth along the optical axis per meter along the ray through each pixel's center."""
         return self._directions(1, window)[2]
 
     def _directions(self, supersampling: int, window: Window) -> Float64[np.ndarray, "3 a b"]:
@@ -168,7 +168,7 @@ class StreetCamera:
 
 
 def street_camera(settings: StreetSettings, index: int, world_from_ego: Pose) -> StreetCamera:
-    """Returns camera ``index`` of the rig."""
+    """Return camera ``index`` of the rig."""
     ego_from_camera = at(*_MOUNT, yaw=float(np.radians(CAMERA_YAWS_DEGREES[index])))
     ego_from_camera[:3, :3] = ego_from_camera[:3, :3] @ _EGO_AXES_FROM_CAMERA
     focal = settings.width / 2 / np.tan(np.radians(settings.field_of_view) / 2)
@@ -181,7 +181,7 @@ def street_camera(settings: StreetSettings, index: int, world_from_ego: Pose) ->
 def _directions(
     width: int, height: int, focal_and_center: tuple[float, ...], distortion: tuple[float, ...], supersampling: int
 ) -> Float64[np.ndarray, "3 a b"]:
-    """Returns unit vectors in the camera frame.
+    """Return unit vectors in the camera frame.
 
     The result is cached because all frames of a rig share it: Newton's method takes as long as tracing the rays.
     """
@@ -223,7 +223,7 @@ class Instant:
 
     @staticmethod
     def at(world: World, time: float) -> "Instant":
-        """Returns the street at ``time``, seconds."""
+        """Return the street at ``time``, seconds."""
         scene = Scene.of(world.parts_at(time))
         actors = tuple((actor.pose(time), actor.model.size) for actor in world.actors)
         return Instant(scene, SunView.of(scene, world.weather.sun), world.weather, actors)
@@ -237,12 +237,12 @@ class Instant:
         return False
 
     def actors_within(self, meters: float, camera: StreetCamera) -> list[int]:
-        """Returns positions in World.actors of actors at most ``meters`` from the camera, seen from above."""
+        """Return positions in World.actors of actors at most ``meters`` from the camera, seen from above."""
         here = camera.world_from_camera[:2, 3]
         return [at for at, (pose, _) in enumerate(self.actors) if np.linalg.norm(pose[:2, 3] - here) <= meters]
 
     def seen_by(self, camera: StreetCamera, samples: int, window: Window = EVERYWHERE) -> Sight:
-        """Returns what the pixels of a window see, their light by samples x samples rays each."""
+        """Return what the pixels of a window see, their light by samples x samples rays each."""
         rays = camera.rays(1, window)
         hits = first_hits(self.scene, rays)
         linear = self._radiance(camera, rays, hits, 1) if samples == 1 else self.light(camera, samples, window)
@@ -252,7 +252,7 @@ class Instant:
         return Sight(linear, depth, objects, sky)
 
     def light(self, camera: StreetCamera, samples: int, window: Window = EVERYWHERE) -> Float32[np.ndarray, "3 h w"]:
-        """Returns the light of the same pixels alone."""
+        """Return the light of the same pixels alone."""
         rays = camera.rays(samples, window)
         return self._radiance(camera, rays, first_hits(self.scene, rays), samples)
 
@@ -275,7 +275,7 @@ def captured(
     camera_at: Callable[[float], StreetCamera],
     exposure: float = 0.0,
 ) -> Sight:
-    """Returns what a camera with the settings' readout sees, each strip of rows or columns at its own instant.
+    """Return what a camera with the settings' readout sees, each strip of rows or columns at its own instant.
 
     Args:
         settings: ``readout`` and its direction, ``supersampling`` and, for the number of moments, ``ego_speed``.
@@ -302,7 +302,7 @@ def captured(
 
 
 def _strips(settings: StreetSettings, camera: StreetCamera) -> list[tuple[Window, float]]:
-    """Returns the image's strips from its top or left, and the middle of their exposure, seconds."""
+    """Return the image's strips from its top or left, and the middle of their exposure, seconds."""
     if not settings.readout:
         return [(EVERYWHERE, 0.0)]
     reads_columns = settings.readout_direction in ("left", "right")
@@ -317,7 +317,7 @@ def _strips(settings: StreetSettings, camera: StreetCamera) -> list[tuple[Window
 
 
 def _moments(settings: StreetSettings, camera: StreetCamera, exposure: float) -> list[float]:
-    """Returns the middles of equal parts of an exposure, seconds from its own."""
+    """Return the middles of equal parts of an exposure, seconds from its own."""
     moved = float(camera.intrinsics[0, 0]) * settings.ego_speed * exposure / _NEAR
     count = int(np.clip(np.ceil(moved), 3, 9))
     return [exposure * ((place + 0.5) / count - 0.5) for place in range(count)]

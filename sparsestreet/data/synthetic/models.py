@@ -33,7 +33,7 @@ class Model(Protocol):
         ...
 
     def parts(self, traveled: float) -> list[Part]:
-        """Returns the parts after ``traveled`` meters; wheels turn and legs walk with the distance."""
+        """Return the parts after ``traveled`` meters; wheels turn and legs walk with the distance."""
         ...
 
 
@@ -90,7 +90,7 @@ class Car:
         return (self._x(0.19), self._x(0.80))
 
     def _x(self, share: float) -> float:
-        """Returns x in the box frame for a share of the length, measured from the front bumper."""
+        """Return x in the box frame for a share of the length, measured from the front bumper."""
         return self.style.length * (0.5 - share)
 
     def _body(self) -> Part:
@@ -212,7 +212,7 @@ class Pedestrian:
         return parts
 
     def leg(self, side: int, traveled: float) -> tuple[Point, Point, Point]:
-        """Returns hip, knee and foot of the left (1) or right (-1) leg after ``traveled`` meters."""
+        """Return hip, knee and foot of the left (1) or right (-1) leg after ``traveled`` meters."""
         h, scale = self.height, self.height / 1.75
         ground, y = -h / 2, side * 0.085 * scale
         swing, lift = self._swing(side, traveled)
@@ -222,7 +222,7 @@ class Pedestrian:
         return (0.0, y, ground + 0.50 * h), knee, foot
 
     def arm(self, side: int, traveled: float) -> tuple[Point, Point, Point]:
-        """Returns shoulder, elbow and hand of an arm, which swings against its leg."""
+        """Return shoulder, elbow and hand of an arm, which swings against its leg."""
         h, scale = self.height, self.height / 1.75
         shoulder, y = -h / 2 + 0.80 * h, side * 0.19 * scale
         swing = -self._swing(side, traveled)[0]
@@ -231,7 +231,7 @@ class Pedestrian:
         return (0.0, y, shoulder - 0.03 * h), elbow, hand
 
     def _swing(self, side: int, traveled: float) -> tuple[float, float]:
-        """Returns how far a leg is ahead and how high it is lifted, both from -1 to 1."""
+        """Return how far a leg is ahead and how high it is lifted, both from -1 to 1."""
         gait, reach = 2 * np.pi * traveled / self.stride, 1.0 if side > 0 else 1 - self.limp
         return float(np.sin(gait)) * side * reach, float(np.cos(gait)) * side * reach
 
@@ -295,7 +295,7 @@ def random_cyclist(rng: np.random.Generator) -> Cyclist:
 
 
 def tree(rng: np.random.Generator) -> list[Part]:
-    """Returns a trunk with a crown of overlapping balls; origin at the foot."""
+    """Return a trunk with a crown of overlapping balls; origin at the foot."""
     height, reach = float(rng.uniform(5.0, 7.5)), float(rng.uniform(1.1, 1.6))
     stem = height - 1.6 * reach
     bark = Grainy((0.16, 0.11, 0.07), 0.12, 0.25, float(rng.uniform(0.0, 20.0)))
@@ -316,7 +316,7 @@ def tree(rng: np.random.Generator) -> list[Part]:
 
 
 def lamp_post(towards: int) -> list[Part]:
-    """Returns a post with an arm over the road; origin at the foot, ``towards`` is +1 if the road lies at +y."""
+    """Return a post with an arm over the road; origin at the foot, ``towards`` is +1 if the road lies at +y."""
     steel, head = Plain((0.13, 0.14, 0.15), 0.15), Plain((0.55, 0.55, 0.52))
     return [
         Part(Cylinder(0.10, 0.4), steel, at(0.0, 0.0, 0.4)),
@@ -327,7 +327,7 @@ def lamp_post(towards: int) -> list[Part]:
 
 
 def bin_box(rng: np.random.Generator) -> list[Part]:
-    """Returns a litter bin; origin at the foot."""
+    """Return a litter bin; origin at the foot."""
     color = ((0.05, 0.16, 0.08), (0.40, 0.10, 0.03), (0.10, 0.12, 0.16))[rng.integers(3)]
     return [
         Part(box(0.45, 0.45, 0.9), Grainy(color, 0.3, 0.05), at(0.0, 0.0, 0.45)),
@@ -336,7 +336,7 @@ def bin_box(rng: np.random.Generator) -> list[Part]:
 
 
 def house(rng: np.random.Generator, width: float, depth: float, road_side: int) -> list[Part]:
-    """Returns a house with its front on the plane y = 0 and its body away from the road; centered in x.
+    """Return a house with its front on the plane y = 0 and its body away from the road; centered in x.
 
     ``road_side`` is +1 if the road lies at +y.
     """

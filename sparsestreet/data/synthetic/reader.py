@@ -29,7 +29,7 @@ from sparsestreet.types import Camera, Frame, View
 def street_truth(
     settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"], world: World | None = None
 ) -> Truth:
-    """Returns a function: a camera and a time in the log's world -> what the street's camera would record there.
+    """Return a function: a camera and a time in the log's world -> what the street's camera would record there.
 
     ``world`` is the street with other actors; None: as the settings make it.
 
@@ -74,7 +74,7 @@ def street_truth(
 
 
 def _camera_at(camera: Camera, street_from_world: Float64[Tensor, "4 4"], seconds: float) -> StreetCamera:
-    """Returns the camera where its shutter moves it to within ``seconds`` from the middle of the readout."""
+    """Return the camera where its shutter moves it to within ``seconds`` from the middle of the readout."""
     world_from_camera = (street_from_world @ inverse(camera.camera_from_world.double())).numpy()
     if camera.shutter is not None and seconds:
         motion, share = np.eye(4), seconds / camera.shutter.seconds
@@ -127,7 +127,7 @@ class StreetReader(LogReader):
         return replace(log, truth=street_truth(self.settings, log.dataset_from_world))
 
     def data_hash(self) -> str:
-        """Returns the street's name, which holds a hash of all settings: they determine what the street shows."""
+        """Return the street's name, which holds a hash of all settings: they determine what the street shows."""
         return street_name(self.settings)
 
     def _made(self) -> DriveStudioReader:

@@ -22,7 +22,7 @@ _SOFT = 0.25
 
 
 def dirt_opacity(settings: StreetSettings, camera: int) -> Float32[np.ndarray, "h w"] | None:
-    """Returns the share of each pixel's light that dirt takes; None: the camera is clean.
+    """Return the share of each pixel's light that dirt takes; None: the camera is clean.
 
     Three spots of one size, away from each other and from the border. Where they take half of the light they cover
     ``settings.dirt`` of the image.
@@ -43,7 +43,7 @@ def dirt_opacity(settings: StreetSettings, camera: int) -> Float32[np.ndarray, "
 
 
 def behind_dirt(sight: Sight, opacity: Float32[np.ndarray, "h w"]) -> Sight:
-    """Returns what a camera sees through the dirt; depth and objects are those of the street."""
+    """Return what a camera sees through the dirt; depth and objects are those of the street."""
     return replace(sight, linear=sight.linear * (1 - opacity) + np.float32(_LIGHT) * opacity)
 
 
@@ -52,7 +52,7 @@ _SMOOTH = 0.5
 
 
 def recorded_gains(settings: StreetSettings, frame: int, camera: int) -> Float32[np.ndarray, "3"] | None:
-    """Returns factors of an image's stored red, green and blue; None if the settings have neither effect.
+    """Return factors of an image's stored red, green and blue; None if the settings have neither effect.
 
     They multiply sRGB values, not light: a learned gain of stored colors can undo them but for rounding and white.
     """
@@ -63,7 +63,7 @@ def recorded_gains(settings: StreetSettings, frame: int, camera: int) -> Float32
 
 
 def exposure_walk(settings: StreetSettings, camera: int) -> Float64[np.ndarray, " f"]:
-    """Returns a camera's exposure in each frame, EV: mean 0 and the standard deviation of the settings.
+    """Return a camera's exposure in each frame, EV: mean 0 and the standard deviation of the settings.
 
     In a drive of one frame it is 0.
     """
@@ -76,7 +76,7 @@ def exposure_walk(settings: StreetSettings, camera: int) -> Float64[np.ndarray, 
 
 
 def _tints(settings: StreetSettings) -> Float64[np.ndarray, "cameras 3"]:
-    """Returns the logarithms of the constant gains: 0 on average over cameras, and over channels."""
+    """Return the logarithms of the constant gains: 0 on average over cameras, and over channels."""
     drawn = stream(settings.seed, "white balance").standard_normal((settings.num_cameras, 3))
     drawn -= drawn.mean(0)
     drawn -= drawn.mean(1, keepdims=True)
@@ -92,7 +92,7 @@ _FALL = 0.05
 
 
 def hood_coverage(settings: StreetSettings, camera: int) -> Float32[np.ndarray, "h w"] | None:
-    """Returns the share of each pixel that the hood covers, ``settings.hood`` on average; None: the camera sees none.
+    """Return the share of each pixel that the hood covers, ``settings.hood`` on average; None: the camera sees none.
 
     Its edge is a parabola, higher in the middle of the image than at the sides.
     """
@@ -105,7 +105,7 @@ def hood_coverage(settings: StreetSettings, camera: int) -> Float32[np.ndarray, 
 
 
 def behind_hood(sight: Sight, coverage: Float32[np.ndarray, "h w"], camera: StreetCamera, weather: Weather) -> Sight:
-    """Returns what a camera sees with the hood in front: neither street nor sky where half of a pixel is covered."""
+    """Return what a camera sees with the hood in front: neither street nor sky where half of a pixel is covered."""
     covered = coverage >= 0.5
     linear = sight.linear + coverage * (_hood(camera, weather) - sight.linear)
     objects = np.where(covered, np.int16(BACKGROUND), sight.object_indices)
@@ -119,7 +119,7 @@ def behind_hood(sight: Sight, coverage: Float32[np.ndarray, "h w"], camera: Stre
 
 
 def _hood(camera: StreetCamera, weather: Weather) -> Float32[np.ndarray, "3 h w"]:
-    """Returns the hood's light: dark paint in the shade, in which sky and street are mirrored."""
+    """Return the hood's light: dark paint in the shade, in which sky and street are mirrored."""
     towards = camera.rays(1).directions
     across = np.broadcast_to((np.arange(camera.width) + 0.5) / camera.width * 2 - 1, towards.shape[1:])
     local = np.stack((_BULGE * across, np.full_like(across, -1), np.full_like(across, _FALL)))
@@ -136,7 +136,7 @@ _SHOT = 0.01
 
 
 def at_night(settings: StreetSettings, sight: Sight, frame: int, camera: int) -> Sight:
-    """Returns what the sensor records of 2^-night of the light; the noise of each image is its own."""
+    """Return what the sensor records of 2^-night of the light; the noise of each image is its own."""
     if not settings.night:
         return sight
     dark = sight.linear * np.float32(2.0**-settings.night)
@@ -157,7 +157,7 @@ class StreetSweep:
 
 
 def sweep(settings: StreetSettings, scene: Scene, world_from_ego: Pose, frame: int) -> StreetSweep:
-    """Returns one turn of the sensor; ``frame`` only seeds dropout and noise."""
+    """Return one turn of the sensor; ``frame`` only seeds dropout and noise."""
     sensor = settings.lidar
     world_from_lidar = world_from_ego @ at(_AHEAD, 0.0, sensor.height)
     local = _directions(sensor)
@@ -205,7 +205,7 @@ class StreetFrame:
 
 
 def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFrame:
-    """Renders all images, each at its own instant, and the lidar and boxes of frame ``index``."""
+    """Render all images, each at its own instant, and the lidar and boxes of frame ``index``."""
     time = index / settings.frame_rate
     # Cameras that fire together share the instants of their strips.
     instant_at = lru_cache(maxsize=64)(lambda seconds: Instant.at(world, seconds))
@@ -223,7 +223,7 @@ def render_frame(settings: StreetSettings, world: World, index: int) -> StreetFr
 def _recorded(
     settings: StreetSettings, world: World, instant_at: Callable[[float], Instant], frame: int, camera: int
 ) -> StreetImage:
-    """Returns what a camera records of a frame, at its own instant."""
+    """Return what a camera records of a frame, at its own instant."""
     time = settings.image_time(frame, camera)
 
     def camera_at(seconds: float) -> StreetCamera:
@@ -241,10 +241,10 @@ def _recorded(
 
 
 def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:
-    """Renders what a camera sees at an instant; of the settings it uses only the number of rays per pixel."""
+    """Render what a camera sees at an instant; of the settings it uses only the number of rays per pixel."""
     return developed(camera, instant.seen_by(camera, settings.supersampling))
 
 
 def developed(camera: StreetCamera, sight: Sight, gains: Float32[np.ndarray, "3"] | None = None) -> StreetImage:
-    """Returns the picture of what a camera saw."""
+    """Return the picture of what a camera saw."""
     return StreetImage(camera, to_srgb(sight.linear, gains), sight.depth, sight.object_indices, sight.sky)

@@ -18,7 +18,7 @@ _TINY = np.float32(1e-12)
 
 
 def rotated(rows: Float32[np.ndarray, "k 3"], vectors: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "k m"]:
-    """Returns rows @ vectors without matmul, whose BLAS starts threads for products too small to gain from them."""
+    """Return rows @ vectors without matmul, whose BLAS starts threads for products too small to gain from them."""
     return np.einsum("kj,jm->km", rows, vectors)
 
 
@@ -32,11 +32,11 @@ class Shape(Protocol):
         ...
 
     def enter(self, origins: Float32[np.ndarray, "3 m"], directions: Vectors) -> Scalars:
-        """Returns the distance at which each ray enters; ``origins`` has a column per ray or one for all."""
+        """Return the distance at which each ray enters; ``origins`` has a column per ray or one for all."""
         ...
 
     def normals(self, points: Vectors) -> Vectors:
-        """Returns outward unit normals at points on the surface."""
+        """Return outward unit normals at points on the surface."""
         ...
 
 
@@ -45,12 +45,12 @@ def _entered(near: Scalars, far: Scalars) -> Scalars:
 
 
 def _away_from_zero(values: np.ndarray) -> np.ndarray:
-    """Returns the values with magnitudes of at least 1e-12, so that they can divide."""
+    """Return the values with magnitudes of at least 1e-12, so that they can divide."""
     return np.where(np.abs(values) < _TINY, _TINY, values)
 
 
 def _slab(origins: Float32[np.ndarray, " m"], directions: Scalars, half: float) -> tuple[Scalars, Scalars]:
-    """Returns the distances at which rays enter and leave |coordinate| <= half."""
+    """Return the distances at which rays enter and leave |coordinate| <= half."""
     inverse = np.float32(1) / _away_from_zero(directions)
     center = -origins * inverse
     reach = np.float32(half) * np.abs(inverse)
@@ -95,7 +95,7 @@ class Polytope:
         return _entered(near, far)
 
     def depths(self, points: Vectors) -> Float32[np.ndarray, "k n"]:
-        """Returns the depth of each point inside each face plane, meters (negative outside)."""
+        """Return the depth of each point inside each face plane, meters (negative outside)."""
         return self.offsets[:, None] - rotated(self.normals_out, points)
 
     def normals(self, points: Vectors) -> Vectors:
@@ -184,7 +184,7 @@ class Capsule:
 
 
 def _round_wall(origins: Float32[np.ndarray, "3 m"], directions: Vectors, radius: float) -> tuple[Scalars, Scalars]:
-    """Returns where rays enter and leave the infinite cylinder about z; an empty interval for rays that miss."""
+    """Return where rays enter and leave the infinite cylinder about z; an empty interval for rays that miss."""
     a = np.maximum(directions[0] ** 2 + directions[1] ** 2, _TINY)
     middle = -(origins[0] * directions[0] + origins[1] * directions[1]) / a
     x, y = origins[0] + middle * directions[0], origins[1] + middle * directions[1]
@@ -199,7 +199,7 @@ def _unit(vectors: Vectors) -> Vectors:
 
 
 def box(length: float, width: float, height: float) -> Box:
-    """Returns a box with the given full sides along x, y, z, meters.
+    """Return a box with the given full sides along x, y, z, meters.
 
     >>> side = box(4.0, 2.0, 1.5)
     >>> side.enter(np.float32([[-5], [0], [0]]), np.float32([[1], [0], [0]])).tolist()
@@ -209,7 +209,7 @@ def box(length: float, width: float, height: float) -> Box:
 
 
 def extrusion(profile: list[tuple[float, float]], bottom_width: float, top_width: float) -> Polytope:
-    """Returns a solid with a convex profile in x and z, and the given widths at its lowest and highest z.
+    """Return a solid with a convex profile in x and z, and the given widths at its lowest and highest z.
 
     The profile is counter-clockwise as seen from -y.
     """

@@ -34,7 +34,7 @@ from sparsestreet.types import Shutter, View
 
 
 def noisy_camera(settings: StreetSettings, world_from_camera: Pose, frame: int, camera: int) -> Pose:
-    """Returns the pose that the files say an image has: the true one and a random rigid motion of its own."""
+    """Return the pose that the files say an image has: the true one and a random rigid motion of its own."""
     if not settings.pose_noise:
         return world_from_camera
     meters, degrees = settings.pose_noise
@@ -46,7 +46,7 @@ def noisy_camera(settings: StreetSettings, world_from_camera: Pose, frame: int, 
 
 
 def noisy_box(settings: StreetSettings, world_from_object: Pose, name: str, frame: int) -> Pose:
-    """Returns the pose that the files say a box has. It stays upright, as people draw boxes."""
+    """Return the pose that the files say a box has. It stays upright, as people draw boxes."""
     if not settings.box_noise:
         return world_from_object
     meters, degrees = settings.box_noise
@@ -62,7 +62,7 @@ _TOE = (0.13, 0.0, -0.01)
 
 
 def joint_rotations(person: Pedestrian, traveled: float) -> Float64[np.ndarray, "24 3 3"]:
-    """Returns the rotations of the joints after ``traveled`` meters: box_from_body, then each relative to its parent.
+    """Return the rotations of the joints after ``traveled`` meters: box_from_body, then each relative to its parent.
 
     Limbs point in the directions of the rendered person's limbs, by the shortest turn. The trunk and the hands are at
     rest.
@@ -78,7 +78,7 @@ def joint_rotations(person: Pedestrian, traveled: float) -> Float64[np.ndarray, 
 
 
 def _point(rotations: Float64[np.ndarray, "24 3 3"], chain: list[str], places: tuple[Point, ...]) -> None:
-    """Turns the joints of a chain with its root at rest, so that the limbs point along ``places``."""
+    """Turn the joints of a chain with its root at rest, so that the limbs point along ``places``."""
     joints = [JOINTS.index(name) for name in chain]
     bones = np.diff(rest_joints().double().numpy()[joints], axis=0)
     wanted = np.diff(np.array(places), axis=0) @ _BOX_FROM_BODY
@@ -89,7 +89,7 @@ def _point(rotations: Float64[np.ndarray, "24 3 3"], chain: list[str], places: t
 
 
 def _shortest_turn(start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """Returns the rotation by less than half a turn that takes one direction to another."""
+    """Return the rotation by less than half a turn that takes one direction to another."""
     a, b = start / np.linalg.norm(start), end / np.linalg.norm(end)
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis)
@@ -109,7 +109,7 @@ class BodyWriter:
     """Instance id -> its data under DriveStudio's names."""
 
     def record(self, key: int, actor: int, frame: StreetFrame) -> None:
-        """Records the pose of an actor in a frame if it is a visible pedestrian; ``key`` is its instance id."""
+        """Record the pose of an actor in a frame if it is a visible pedestrian; ``key`` is its instance id."""
         person = self.world.actors[actor]
         pixels = [np.count_nonzero(image.object_indices == actor) for image in frame.images]
         camera = int(np.argmax(pixels))
@@ -126,7 +126,7 @@ class BodyWriter:
         set_pose(stored, frame.index, rotations, camera)
 
     def write(self, path: Path) -> None:
-        """Writes the file if anybody was seen."""
+        """Write the file if anybody was seen."""
         if self._people:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(pickled_people(self._people))
@@ -137,7 +137,7 @@ AnyView = TypeVar("AnyView", bound=View)
 
 
 def write_declared(settings: StreetSettings, world: World, root: Path) -> None:
-    """Writes the file if the settings have something to declare, and let it be known."""
+    """Write the file if the settings have something to declare, and let it be known."""
     said: dict[str, Any] = {}
     if settings.readout and settings.readout_known:
         cameras, frames = range(settings.num_cameras), range(settings.num_frames)
@@ -150,7 +150,7 @@ def write_declared(settings: StreetSettings, world: World, root: Path) -> None:
 
 
 def with_declared(log: DrivingLog, settings: StreetSettings, root: Path) -> DrivingLog:
-    """Returns the log whose views have what the street's file declares; the log itself if there is none."""
+    """Return the log whose views have what the street's file declares; the log itself if there is none."""
     path = root / _FILE
     if not path.is_file():
         return log
@@ -177,7 +177,7 @@ def with_declared(log: DrivingLog, settings: StreetSettings, root: Path) -> Driv
 
 
 def _motion(settings: StreetSettings, world: World, frame: int, camera: int) -> list[float]:
-    """Returns translation (meters) and rotation vector (radians) over the readout, as ``Shutter`` has them."""
+    """Return translation (meters) and rotation vector (radians) over the readout, as ``Shutter`` has them."""
     middle = settings.image_time(frame, camera)
     times = (middle - settings.readout / 2, middle, middle + settings.readout / 2)
     start, pose, end = (street_camera(settings, camera, world.ego.pose(time)).world_from_camera for time in times)
@@ -221,7 +221,7 @@ class StreetWriter:
         np.savetxt(self._file("lidar_pose", f"{frame.index:03d}.txt"), frame.sweep.world_from_lidar)
 
     def finish(self) -> None:
-        """Writes the files about the whole drive."""
+        """Write the files about the whole drive."""
         self._file("instances", "instances_info.json").write_text(json.dumps(self._instances, indent=1))
         self._file("instances", "frame_instances.json").write_text(json.dumps(self._frames, indent=1))
         write_declared(self.settings, self.world, self.root)
@@ -250,7 +250,7 @@ class StreetWriter:
         return self.root / folder / name
 
     def _annotate(self, frame: StreetFrame) -> list[int]:
-        """Records the boxes of this frame and returns the annotated actors."""
+        """Record the boxes of this frame and return the annotated actors."""
         actors = self.world.actors
         pixels, returns = np.zeros(len(actors), int), np.zeros(len(actors), int)
         for image in frame.images:
@@ -304,7 +304,7 @@ class StreetWriter:
 
 
 def _count(indices: Int16[np.ndarray, "..."], actors: int) -> np.ndarray:
-    """Returns how often each actor's index occurs."""
+    """Return how often each actor's index occurs."""
     return np.bincount(indices[indices >= 0], minlength=actors)
 
 
@@ -323,7 +323,7 @@ _LATER = frozenset(
 
 
 def make_street(settings: StreetSettings, root: Path, progress: Callable[[int, int], None] | None = None) -> Path:
-    """Writes the street that ``settings`` describe to ``root`` (DriveStudio's layout) and returns ``root``.
+    """Write the street that ``settings`` describe to ``root`` (DriveStudio's layout) and return ``root``.
 
     An existing street of the same settings is kept. The street is written next to ``root`` and renamed when complete,
     so an interruption leaves nothing. ``progress`` is called with the number of finished frames and of all frames.
@@ -350,7 +350,7 @@ def make_street(settings: StreetSettings, root: Path, progress: Callable[[int, i
 
 
 def street_name(settings: StreetSettings) -> str:
-    """Returns a folder's name for the street: its size, a hash of all settings but the seed, and the seed.
+    """Return a folder's name for the street: its size, a hash of all settings but the seed, and the seed.
 
     >>> street_name(StreetSettings(num_frames=5, seed=7)).startswith("320x192x5_")
     True
@@ -375,7 +375,7 @@ def _holds_street(root: Path, settings: StreetSettings) -> bool:
 
 
 def _label(settings: StreetSettings) -> dict:
-    """Returns the content of street.json, converted by JSON so that tuples compare as the lists they become."""
+    """Return the content of street.json, converted by JSON so that tuples compare as the lists they become."""
     # Streets without an effect keep the name that they had before streets could have it.
     usual = {field.name: field.default for field in dataclasses.fields(settings) if field.name in _LATER}
     said = {name: value for name, value in dataclasses.asdict(settings).items() if value != usual.get(name, ...)}
@@ -394,7 +394,7 @@ def _write(settings: StreetSettings, folder: Path, progress: Callable[[int, int]
 
 
 def _frames(settings: StreetSettings, world: World) -> Iterator[StreetFrame]:
-    """Yields all frames in order, rendered by threads, because NumPy releases the interpreter while it computes."""
+    """Yield all frames in order, rendered by threads, because NumPy releases the interpreter while it computes."""
     pending: deque[Future[StreetFrame]] = deque()
     workers = max(2, min(MOST_WORKERS, torch.get_num_threads()))
     executor = ThreadPoolExecutor(workers)

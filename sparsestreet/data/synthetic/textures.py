@@ -27,7 +27,7 @@ class Appearance:
 @runtime_checkable
 class Surface(Protocol):
     def appearance(self, points: Vectors, normals: Vectors, footprints: Vectors) -> Appearance:
-        """Returns the appearance at points of the part's frame; ``footprints`` are a pixel's extents in it, meters."""
+        """Return the appearance at points of the part's frame; ``footprints`` are a pixel's extents in it, meters."""
         ...
 
 
@@ -36,7 +36,7 @@ def column(color: Color) -> Float32[np.ndarray, "3 1"]:
 
 
 def mix(below: Float32[np.ndarray, "3 _"], above: Float32[np.ndarray, "3 _"], share: Scalars) -> Vectors:
-    """Returns ``below`` with ``above`` painted over it where ``share`` is 1.
+    """Return ``below`` with ``above`` painted over it where ``share`` is 1.
 
     >>> mix(column((0.0, 0.0, 0.0)), column((1.0, 1.0, 1.0)), np.float32([0.25]))[0].tolist()
     [0.25]
@@ -45,7 +45,7 @@ def mix(below: Float32[np.ndarray, "3 _"], above: Float32[np.ndarray, "3 _"], sh
 
 
 def strip(x: Scalars, low: float, high: float, footprint: Scalars) -> Scalars:
-    """Returns the share of the interval of length ``footprint`` around x that lies in [low, high].
+    """Return the share of the interval of length ``footprint`` around x that lies in [low, high].
 
     >>> strip(np.float32([0.0]), 0.0, 1.0, np.float32([1.0])).tolist()
     [0.5]
@@ -56,7 +56,7 @@ def strip(x: Scalars, low: float, high: float, footprint: Scalars) -> Scalars:
 
 
 def beyond(x: Scalars, edge: float, footprint: Scalars) -> Scalars:
-    """Returns the share of the interval of length ``footprint`` around x that lies above ``edge``.
+    """Return the share of the interval of length ``footprint`` around x that lies above ``edge``.
 
     >>> beyond(np.float32([0.25]), 0.0, np.float32([1.0])).tolist()
     [0.75]
@@ -65,7 +65,7 @@ def beyond(x: Scalars, edge: float, footprint: Scalars) -> Scalars:
 
 
 def stripes(x: Scalars, period: float, low: float, high: float, footprint: Scalars) -> Scalars:
-    """Returns the share of the interval of length ``footprint`` around x in the strips [low, high] + k period.
+    """Return the share of the interval of length ``footprint`` around x in the strips [low, high] + k period.
 
     0 <= low < high <= period.
 
@@ -78,7 +78,7 @@ def stripes(x: Scalars, period: float, low: float, high: float, footprint: Scala
 
 
 def _painted(x: Scalars, period: float, low: float, high: float) -> Scalars:
-    """Returns the length of the strips between 0 and x."""
+    """Return the length of the strips between 0 and x."""
     whole = np.floor(x * np.float32(1 / period))
     rest = x - whole * np.float32(period)
     return whole * np.float32(high - low) + np.clip(rest - np.float32(low), 0, np.float32(high - low))
@@ -90,7 +90,7 @@ _SIZE = _CELLS * _TEXELS_PER_CELL
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Returns the random numbers of one element of the street; adding an element does not change the others.
+    """Return the random numbers of one element of the street; adding an element does not change the others.
 
     >>> stream(0, "houses").random() == stream(0, "houses").random()
     True
@@ -100,7 +100,7 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 @functools.cache
 def _table() -> Float32[np.ndarray, " m"]:
-    """Returns one tile of periodic value noise, mean 0 and standard deviation 1, fine enough to read unfiltered."""
+    """Return one tile of periodic value noise, mean 0 and standard deviation 1, fine enough to read unfiltered."""
     lattice = np.random.default_rng(20240229).standard_normal((_CELLS, _CELLS))
     rows = _interpolated(lattice)
     tile = _interpolated(np.ascontiguousarray(rows.T)).T
@@ -118,7 +118,7 @@ def _interpolated(values: Float64[np.ndarray, "a b"]) -> Float64[np.ndarray, "c 
 def smooth_noise(
     u: Float32[np.ndarray, " n"], v: Float32[np.ndarray, " n"], cell: float, footprint: Float32[np.ndarray, " n"]
 ) -> Float32[np.ndarray, " n"]:
-    """Returns noise with features of ``cell`` meters, faded out if a pixel's ``footprint`` (meters) is half a cell."""
+    """Return noise with features of ``cell`` meters, faded out if a pixel's ``footprint`` (meters) is half a cell."""
     scale = np.float32(_TEXELS_PER_CELL / cell)
     column = np.floor(u * scale).astype(np.int32) & (_SIZE - 1)
     row = np.floor(v * scale).astype(np.int32) & (_SIZE - 1)
@@ -129,7 +129,7 @@ def smooth_noise(
 def cell_random(
     column: Float32[np.ndarray, " n"], row: Float32[np.ndarray, " n"], seed: int
 ) -> Float32[np.ndarray, " n"]:
-    """Returns a number in [0, 1) that depends only on the integer cell and the seed (a multiply-xorshift hash)."""
+    """Return a number in [0, 1) that depends only on the integer cell and the seed (a multiply-xorshift hash)."""
     with np.errstate(over="ignore"):
         h = column.astype(np.int32).view(np.uint32) * np.uint32(0x9E3779B1)
         h ^= row.astype(np.int32).view(np.uint32) * np.uint32(0x85EBCA77)
@@ -256,7 +256,7 @@ class Wheel:
 
 
 def metallic(rng: np.random.Generator) -> Color:
-    """Returns a car color: mostly white, silver, gray, black; sometimes red, blue, green, yellow."""
+    """Return a car color: mostly white, silver, gray, black; sometimes red, blue, green, yellow."""
     palette = (
         (0.62, 0.62, 0.62), (0.40, 0.41, 0.42), (0.17, 0.18, 0.19), (0.03, 0.03, 0.035), (0.36, 0.03, 0.03),
         (0.03, 0.08, 0.30), (0.04, 0.16, 0.10), (0.55, 0.36, 0.05), (0.10, 0.25, 0.42), (0.42, 0.33, 0.24),
@@ -361,7 +361,7 @@ class Facade:
         return wall * (np.float32(0.78) + np.float32(0.22) * np.clip(face.z / np.float32(0.7), 0, 1))
 
     def _upper(self, face: _Face, albedo: Vectors, s: Scalars, fs: Scalars) -> Vectors:
-        """Returns the wall with ledges between storeys, sills under windows and the cornice."""
+        """Return the wall with ledges between storeys, sills under windows and the cornice."""
         style = self.style
         z, fz = face.z - np.float32(style.ground_floor), face.fz
         low = style.window_low * style.storey
@@ -374,7 +374,7 @@ class Facade:
     def _windows(
         self, face: _Face, s: Scalars, fs: Scalars, column_index: Scalars
     ) -> tuple[tuple[Float32[np.ndarray, "3 1"], Scalars, Vectors], Scalars]:
-        """Returns frame color, frame coverage and glass color; and the coverage of the glass."""
+        """Return frame color, frame coverage and glass color; and the coverage of the glass."""
         style = self.style
         z = (face.z - np.float32(style.ground_floor)) / np.float32(style.storey)
         fz = face.fz / np.float32(style.storey)
@@ -397,7 +397,7 @@ class Facade:
     def _ground_floor(
         self, face: _Face, s: Scalars, fs: Scalars, column_index: Scalars, wall: Vectors
     ) -> tuple[Vectors, Scalars]:
-        """Returns the color of the ground floor and the coverage of its glass."""
+        """Return the color of the ground floor and the coverage of its glass."""
         style = self.style
         z, fz = face.z, face.fz
         kind = cell_random(column_index, np.full_like(s, -7), style.seed)
@@ -556,7 +556,7 @@ class Weather:
     cloud_offset: float
 
     def radiance(self, directions: Vectors) -> Vectors:
-        """Returns the sky in unit directions of the world frame; it has the horizon's color below the horizon."""
+        """Return the sky in unit directions of the world frame; it has the horizon's color below the horizon."""
         up = np.maximum(directions[2], 0)
         sky = mix(column(self.horizon), column(self.zenith), 1 - np.exp(np.float32(-3.2) * up))
         sky = mix(sky, column((0.98, 0.98, 0.99)), self._clouds(directions, up))
@@ -565,7 +565,7 @@ class Weather:
         return sky + column((1.0, 0.9, 0.72)) * glow
 
     def _clouds(self, directions: Vectors, up: Scalars) -> Scalars:
-        """Returns the opacity of clouds on a plane 1 unit above, faded at the horizon, where it would be noise."""
+        """Return the opacity of clouds on a plane 1 unit above, faded at the horizon, where it would be noise."""
         reach = np.float32(1) / (up + np.float32(0.22))
         u, v = directions[0] * reach, directions[1] * reach
         shift, none = np.float32(self.cloud_offset), np.zeros_like(u)
@@ -577,12 +577,12 @@ class Weather:
         return np.float32(0.85) * cover * np.clip(up * 7, 0, 1)
 
     def ambient(self, normals: Vectors) -> Vectors:
-        """Returns the light from sky and ground on a surface with these normals."""
+        """Return the light from sky and ground on a surface with these normals."""
         return mix(column(GROUND_AMBIENT), column(SKY_AMBIENT), np.float32(0.5) + np.float32(0.5) * normals[2])
 
 
 def random_weather(seed: int) -> Weather:
-    """Returns weather with a sun close enough to the street's direction that houses do not shade all of the road."""
+    """Return weather with a sun close enough to the street's direction that houses do not shade all of the road."""
     rng = stream(seed, "weather")
     azimuth = float(rng.uniform(0.12, 0.30)) * np.pi * (1 if rng.random() < 0.5 else -1)
     if rng.random() < 0.6:  # from behind, so that more of the front camera's view is lit

@@ -25,7 +25,7 @@ class Part:
 
 
 def placed(parts: list[Part], world_from_object: Pose, object_index: int = BACKGROUND) -> list[Part]:
-    """Returns the parts of an object, moved to the world."""
+    """Return the parts of an object, moved to the world."""
     return [
         replace(part, frame_from_part=world_from_object @ part.frame_from_part, object_index=object_index)
         for part in parts
@@ -33,7 +33,7 @@ def placed(parts: list[Part], world_from_object: Pose, object_index: int = BACKG
 
 
 def at(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
-    """Returns a pose at a position, turned by ``yaw`` radians about z.
+    """Return a pose at a position, turned by ``yaw`` radians about z.
 
     >>> at(1.0, 2.0, 0.0)[:3, 3].tolist()
     [1.0, 2.0, 0.0]
@@ -45,7 +45,7 @@ def at(x: float, y: float, z: float, yaw: float = 0.0) -> Pose:
 
 
 def axis_along_y(x: float, y: float, z: float) -> Pose:
-    """Returns a pose whose z axis is the frame's y axis, as for wheels on an axle."""
+    """Return a pose whose z axis is the frame's y axis, as for wheels on an axle."""
     pose = np.eye(4)
     pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     pose[:3, 3] = x, y, z
@@ -53,7 +53,7 @@ def axis_along_y(x: float, y: float, z: float) -> Pose:
 
 
 def limb(start: Point, end: Point, radius: float, surface: Surface) -> Part:
-    """Returns a capsule whose axis runs from one point to another, meters."""
+    """Return a capsule whose axis runs from one point to another, meters."""
     a, b = np.array(start, np.float64), np.array(end, np.float64)
     length = float(np.linalg.norm(b - a))
     axis = (b - a) / length
@@ -95,7 +95,7 @@ class Scene:
         return Scene(tuple(parts), rotations, centers, half, corners, rotations * half[:, None], objects)
 
     def to_part(self, index: int, points: Float32[np.ndarray, "3 m"]) -> Float32[np.ndarray, "3 m"]:
-        """Returns world points in the frame of a part."""
+        """Return world points in the frame of a part."""
         return rotated(self.rotations[index].T, points - self.centers[index][:, None])
 
     def turn_to_part(self, index: int, directions: Vectors) -> Vectors:
@@ -105,14 +105,14 @@ class Scene:
         return rotated(self.rotations[index], directions)
 
     def distances(self, origin: Float32[np.ndarray, "3"]) -> Float32[np.ndarray, " p"]:
-        """Returns a lower bound of the distance from a point to each part, meters."""
+        """Return a lower bound of the distance from a point to each part, meters."""
         local = np.einsum("pji,pj->pi", self.rotations, origin - self.centers)
         return np.linalg.norm(np.maximum(np.abs(local) - self.half_extents, 0), axis=1)
 
     def in_bundle(
         self, among: Int[np.ndarray, " c"], origin: Float32[np.ndarray, "3"], planes: Float32[np.ndarray, "k 3"]
     ) -> Int[np.ndarray, " d"]:
-        """Returns the parts that lie wholly outside none of the planes through ``origin`` (normals point inwards)."""
+        """Return the parts that lie wholly outside none of the planes through ``origin`` (normals point inwards)."""
         # The support function of a box is the reach of its farthest corner along each normal.
         reach = np.abs(planes @ self.half_axes[among]).sum(2)
         heights = (self.centers[among] - origin) @ planes.T + reach
@@ -138,7 +138,7 @@ class SunView:
         return SunView(sun, axes, seen.min(1) - _MARGIN, seen.max(1) + _MARGIN)
 
     def blockers(self, seen: Vectors) -> Int[np.ndarray, " c"]:
-        """Returns parts that may lie between the sun and some of the points, which are in this view's coordinates."""
+        """Return parts that may lie between the sun and some of the points, which are in this view's coordinates."""
         low, high = seen.min(1), seen.max(1)
         beside = (self.low[:, :2] > high[:2]) | (self.high[:, :2] < low[:2])
         return np.flatnonzero(~beside.any(1) & (self.high[:, 2] > low[2]))
@@ -172,7 +172,7 @@ class Hits:
 
 
 def first_hits(scene: Scene, rays: Rays) -> Hits:
-    """Returns the nearest part along every ray."""
+    """Return the nearest part along every ray."""
     _, height, width = rays.directions.shape
     distances = np.empty((height, width), np.float32)
     parts = np.empty((height, width), np.int16)
@@ -211,7 +211,7 @@ def _trace_tile(
 
 
 def _bounding_planes(tile: Float32[np.ndarray, "3 a b"]) -> Float32[np.ndarray, "k 3"]:
-    """Returns inward normals of up to four planes through the origin with all rays of the tile on one side.
+    """Return inward normals of up to four planes through the origin with all rays of the tile on one side.
 
     Sides of a lidar's tile are cones, and a lens bends those of a camera's tile. So a plane that would cut off rays is
     turned until it does not, or omitted if the tile is too wide for that.
@@ -230,7 +230,7 @@ def _bounding_planes(tile: Float32[np.ndarray, "3 a b"]) -> Float32[np.ndarray, 
 
 
 def sunlit(scene: Scene, view: SunView, points: Vectors, normals: Vectors, owner: int) -> Bool[np.ndarray, " n"]:
-    """Returns whether the shadow ray from each point reaches the sun. All points lie on the convex part ``owner``.
+    """Return whether the shadow ray from each point reaches the sun. All points lie on the convex part ``owner``.
 
     ``normals`` are outward and in the world frame, as ``points`` are.
     """

@@ -69,7 +69,7 @@ class TunnelLight(Weather):
     """Light of lamps: from above and from the pale road, the same everywhere; the ceiling shades all from the sun."""
 
     def radiance(self, directions: Vectors) -> Vectors:
-        """Returns what is mirrored: the ceiling, brighter straight above."""
+        """Return what is mirrored: the ceiling, brighter straight above."""
         return mix(column(_LIGHT_BELOW), column(_LIGHT_ABOVE), np.maximum(directions[2], np.float32(0)))
 
     def ambient(self, normals: Vectors) -> Vectors:
@@ -77,12 +77,12 @@ class TunnelLight(Weather):
 
 
 def tunnel_light(seed: int) -> TunnelLight:
-    """Returns the light of a tunnel under the weather of a seed."""
+    """Return the light of a tunnel under the weather of a seed."""
     return TunnelLight(**vars(random_weather(seed)))
 
 
 def tunnel(seed: int, end: float) -> list[Part]:
-    """Returns walls on both sides, a ceiling and two ends around a drive of ``end`` meters, closed on all sides."""
+    """Return walls on both sides, a ceiling and two ends around a drive of ``end`` meters, closed on all sides."""
     rng = stream(seed, "tunnel")
     start, stop = -BEHIND, end + AHEAD
     right, left = CURB_RIGHT - FOOTWAY_WIDTH, CURB_LEFT + FOOTWAY_WIDTH
@@ -99,7 +99,7 @@ def tunnel(seed: int, end: float) -> list[Part]:
 
 
 def _fittings(rng: np.random.Generator, start: float, stop: float, right: float, left: float) -> list[Part]:
-    """Returns lamps, tiles, pillars, doors and signs: what tells one place of a tunnel from another."""
+    """Return lamps, tiles, pillars, doors and signs: what tells one place of a tunnel from another."""
     tiles = ((0.62, 0.60, 0.52), (0.50, 0.55, 0.58), (0.55, 0.44, 0.30), (0.30, 0.38, 0.42))
     doors = ((0.05, 0.32, 0.12), (0.45, 0.08, 0.05), (0.08, 0.16, 0.40))
     parts, pitch = [], 5.0
@@ -125,11 +125,11 @@ class Way(ABC):
 
     @abstractmethod
     def traveled(self, time: float) -> float:
-        """Returns meters that its wheels or legs have moved since time 0."""
+        """Return meters that its wheels or legs have moved since time 0."""
 
     @abstractmethod
     def pose(self, time: float, height: float) -> Pose:
-        """Returns world from object, with the object's origin ``height`` meters above the road."""
+        """Return world from object, with the object's origin ``height`` meters above the road."""
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class Path(Way):
         return self.start + self.speed * time, self.y + self.shift * self._eased(time)
 
     def heading(self, time: float) -> float:
-        """Returns the angle of the path's tangent from +x, radians."""
+        """Return the angle of the path's tangent from +x, radians."""
         if self.speed == 0:
             return self.rest_heading
         s = self._phase(time)
@@ -161,11 +161,11 @@ class Path(Way):
         return float(np.arctan2(sideways, self.speed))
 
     def traveled(self, time: float) -> float:
-        """Returns meters along x since time 0; the sideways part would turn wheels by less than a percent."""
+        """Return meters along x since time 0; the sideways part would turn wheels by less than a percent."""
         return abs(self.speed) * time
 
     def pose(self, time: float, height: float) -> Pose:
-        """Returns world from object, with the object's origin ``height`` meters above the road."""
+        """Return world from object, with the object's origin ``height`` meters above the road."""
         x, y = self.position(time)
         return at(x, y, height, self.heading(time))
 
@@ -198,11 +198,11 @@ class Crossing(Way):
         return self.x, self.start + float(np.copysign(self.traveled(time), self.end - self.start))
 
     def traveled(self, time: float) -> float:
-        """Returns meters walked by then."""
+        """Return meters walked by then."""
         return float(np.clip(self.speed * (time - self.at), 0, abs(self.end - self.start)))
 
     def pose(self, time: float, height: float) -> Pose:
-        """Returns world from object, with the object's origin ``height`` meters above the road."""
+        """Return world from object, with the object's origin ``height`` meters above the road."""
         return at(*self.position(time), height, float(np.copysign(np.pi / 2, self.end - self.start)))
 
 
@@ -215,7 +215,7 @@ class EgoDrive:
     """Degrees, of its weaving within the lane (``StreetSettings.turn``)."""
 
     def pose(self, time: float) -> Pose:
-        """Returns world from ego: x forward, y left, z up, origin on the road under the rear axle."""
+        """Return world from ego: x forward, y left, z up, origin on the road under the rear axle."""
         x = self.speed * (time + 0.15 * np.sin(0.9 * time))
         y = 0.12 * np.sin(0.8 * time)
         sideways = 0.12 * 0.8 * np.cos(0.8 * time)
@@ -241,7 +241,7 @@ class Actor:
     """Height of the ground under it, meters."""
 
     def pose(self, time: float) -> Pose:
-        """Returns world from object; the object's origin is the center of its box."""
+        """Return world from object; the object's origin is the center of its box."""
         return self.path.pose(time, self.ground + self.model.size[2] / 2)
 
 
@@ -255,7 +255,7 @@ class World:
     weather: Weather
 
     def parts_at(self, time: float) -> list[Part]:
-        """Returns all parts in the world frame at a time in seconds."""
+        """Return all parts in the world frame at a time in seconds."""
         parts = list(self.scenery)
         for index, actor in enumerate(self.actors):
             parts += placed(actor.model.parts(actor.path.traveled(time)), actor.pose(time), index)
@@ -305,12 +305,12 @@ def _ground(seed: int, end: float) -> list[Part]:
 
 
 def _crossing(seed: int, end: float) -> float:
-    """Returns x of the near end of the zebra crossing."""
+    """Return x of the near end of the zebra crossing."""
     return float(stream(seed, "crossing").uniform(0.35, 0.6)) * end + 16
 
 
 def _houses(seed: int, end: float) -> list[Part]:
-    """Returns two rows of houses along the street, with a few gaps, and a row across its end."""
+    """Return two rows of houses along the street, with a few gaps, and a row across its end."""
     rng = stream(seed, "houses")
     stop = end + AHEAD
     fronts = ((1, CURB_RIGHT - FOOTWAY_WIDTH), (-1, CURB_LEFT + FOOTWAY_WIDTH))
@@ -338,7 +338,7 @@ def _houses(seed: int, end: float) -> list[Part]:
 
 
 def _footway_things(seed: int, end: float) -> list[Part]:
-    """Returns trees, lamp posts and bins in turn along both curbs."""
+    """Return trees, lamp posts and bins in turn along both curbs."""
     rng = stream(seed, "footway")
     parts: list[Part] = []
     for side, y in ((1, CURB_RIGHT - 0.75), (-1, CURB_LEFT + 0.75)):
@@ -354,7 +354,7 @@ def _footway_things(seed: int, end: float) -> list[Part]:
 
 
 def _parked_cars(settings: StreetSettings, end: float) -> list[Actor]:
-    """Returns cars in random places of both parking strips, most of them where the drive passes."""
+    """Return cars in random places of both parking strips, most of them where the drive passes."""
     rng = stream(settings.seed, "parked cars")
     spacing = 6.4
     places = [
@@ -378,7 +378,7 @@ def _parked_cars(settings: StreetSettings, end: float) -> list[Actor]:
 
 
 def _moving_cars(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
-    """Returns oncoming and overtaking cars in turn. Each kind shares a speed and keeps a distance, so none collide."""
+    """Return oncoming and overtaking cars in turn. Each kind shares a speed and keeps a distance, so none collide."""
     rng = stream(settings.seed, "moving cars")
     oncoming, overtaking = -float(rng.uniform(8, 11)), settings.ego_speed + float(rng.uniform(3.5, 5))
     spacing = 11.0
@@ -404,7 +404,7 @@ def _moving_cars(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
 
 
 def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
-    """Returns people on both footways, each on their own line between the trees and the houses."""
+    """Return people on both footways, each on their own line between the trees and the houses."""
     rng = stream(settings.seed, "pedestrians")
     actors = []
     for number in range(settings.num_pedestrians):
@@ -419,7 +419,7 @@ def _pedestrians(settings: StreetSettings, end: float) -> list[Actor]:
 
 
 def _crowd(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
-    """Returns people who cross the street before the ego car, from both sides in turn, and heed no other car."""
+    """Return people who cross the street before the ego car, from both sides in turn, and heed no other car."""
     rng = stream(settings.seed, "crowd")
     actors = []
     for number in range(settings.num_crossing):
@@ -434,7 +434,7 @@ def _crowd(settings: StreetSettings, ego: EgoDrive) -> list[Actor]:
 
 
 def _cyclists(settings: StreetSettings) -> list[Actor]:
-    """Returns cyclists in a row at one speed, in the lane to the right of the ego car, which passes them."""
+    """Return cyclists in a row at one speed, in the lane to the right of the ego car, which passes them."""
     rng = stream(settings.seed, "cyclists")
     speed = settings.ego_speed * float(rng.uniform(0.5, 0.65))
     actors = []

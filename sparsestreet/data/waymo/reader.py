@@ -48,7 +48,7 @@ class Found:
 
 
 def find_segments(root: Path) -> Found:
-    """Raises LogError for a folder that holds segments of neither version, or of both."""
+    """Raise LogError for a folder that holds segments of neither version, or of both."""
     if not root.is_dir():
         raise fault(root, "there is no such folder", "name the folder that holds Waymo's files (data.root)")
     records = {canonical(path.name): path for pattern in _RECORDS for path in sorted(root.glob(pattern))}

@@ -369,7 +369,7 @@ class Spool:
         return key in self._places
 
     def put(self, key: Hashable, data: bytes) -> None:
-        """Raises LogError where the folder has no room."""
+        """Raise LogError where the folder has no room."""
         try:
             with self._lock:
                 file = self._opened()

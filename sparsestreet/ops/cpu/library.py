@@ -186,7 +186,7 @@ def remedy() -> str:
 
 @cache
 def find_library() -> Path | None:
-    """Returns the path of the library, or None if it was not built.
+    """Return the path of the library, or None if it was not built.
 
     It is the path in LIBRARY_VARIABLE, else next to this module, else where an editable install put it. Raises
     RuntimeError if the variable names no file."""
@@ -210,7 +210,7 @@ def find_library() -> Path | None:
 
 @cache
 def load_library() -> ctypes.CDLL:
-    """Loads the library; raises RuntimeError with the remedy if it is absent or was built from other sources."""
+    """Load the library; raise RuntimeError with the remedy if it is absent or was built from other sources."""
     path = find_library()
     if path is None:
         raise RuntimeError(f"the splat library is not built: {remedy()}")

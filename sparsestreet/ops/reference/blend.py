@@ -110,7 +110,7 @@ def leave_one_out(
 
 
 def check_dtype(gaussians: Gaussians, who: str = "backend 'reference'") -> None:
-    """Raises ValueError, naming ``who`` computes, for dtypes other than float32 and float64."""
+    """Raise ValueError, naming ``who`` computes, for dtypes other than float32 and float64."""
     if gaussians.means.dtype not in DTYPES:
         raise ValueError(
             f"{who} computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "

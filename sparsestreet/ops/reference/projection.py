@@ -233,7 +233,7 @@ def visible_rows(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
 
 
 def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, settings: SplatSettings) -> Splats:
-    """Projects the given rows, which must lie in front of the camera."""
+    """Project the given rows, which must lie in front of the camera."""
     in_camera = to_camera(gaussians.means[rows], camera)
     means, factors, refusals = _footprints(gaussians, rows, in_camera, camera, settings)
     determinant, bare = _determinants(factors, settings.eps2d)

@@ -181,7 +181,7 @@ def activate_rows_backward(
     v_means, v_log_scales, v_quaternions, v_logits, v_dc, v_rest, v_multipliers, sums, count, start, rows, limit,
     TERMS: tl.constexpr, STORED: tl.constexpr, MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes gradients; of means, quaternions and poses (``sums`` [programs, 7 count], 0 before) only if PLACED."""
+    """Write gradients; of means, quaternions and poses (``sums`` [programs, 7 count], 0 before) only if PLACED."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given, at = row < rows, start + row
     multiplier = tl.load(multipliers + row, given, 0.0) if MASKED else 1.0

@@ -262,7 +262,7 @@ def thin_pairs(
     records, pair_rows, k, end, tile, part, products, width, height, tiles_x, alpha_max, transmittance_min,
     GATED: tl.constexpr,
 ):  # fmt: skip
-    """Writes the product of 1 - alpha over the pairs of a part, or some value below the limit once it is below."""
+    """Write the product of 1 - alpha over the pairs of a part, or some value below the limit once it is below."""
     t0, t1 = open_light(tile, width, height, tiles_x, 0), open_light(tile, width, height, tiles_x, 1)
     t2, t3 = open_light(tile, width, height, tiles_x, 2), open_light(tile, width, height, tiles_x, 3)
     x, y = centers(tile, tiles_x)
@@ -382,7 +382,7 @@ def any_open(upper_left, upper_right, lower_left, lower_right, transmittance_min
 
 @jit
 def store_quadrant(quadrant, at, inside, layers, DEPTH: tl.constexpr, LASTS: tl.constexpr):
-    """Writes a quadrant's layers: color, light, depth, and where each pixel ended."""
+    """Write a quadrant's layers: color, light, depth, and where each pixel ended."""
     passed, red, green, blue, depth, last = quadrant
     rgb, transmittance, depth_sum, lasts = layers
     tl.store(rgb + 3 * at, red, inside)
@@ -429,7 +429,7 @@ def blend_tiles(
     EXCLUSIVE: tl.constexpr, DEPTH: tl.constexpr, LASTS: tl.constexpr,
     TOGETHER: tl.constexpr, REST: tl.constexpr, GATED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes every pixel of one tile, and those of a part, if needed, into the layers of parts (parts.py).
+    """Write every pixel of one tile, and those of a part, if needed, into the layers of parts (parts.py).
 
     ``lasts`` (if LASTS): the index after the last pair that a pixel took light from, where backward begins. TOGETHER:
     whole tiles and parts. Of parts the first ones of tiles are then blended, and of the others it is computed what they

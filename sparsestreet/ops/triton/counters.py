@@ -24,7 +24,7 @@ def count_tiles_pixels(
     records, pair_rows, pair_slots, begins, ends, order, slots,
     width, height, tiles_x, alpha_max, transmittance_min, EXCLUSIVE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slots of all pairs of one tile: weight, pixels, dominated pixels."""
+    """Write the slots of all pairs of one tile: weight, pixels, dominated pixels."""
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
     x, y, inside = pixels_of(tile, width, height, tiles_x)
@@ -80,7 +80,7 @@ def remove_from_tiles(
     width, height, tiles_x, alpha_max,
     BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slots of all pairs of one tile: largest change, sum of squares."""
+    """Write the slots of all pairs of one tile: largest change, sum of squares."""
     tl.static_assert(BLOCK == 1)
     tile = tl.load(order + tl.program_id(0))
     x, y, inside = pixels_of(tile, width, height, tiles_x)

@@ -69,7 +69,7 @@ def halved(low, high, lane, BIT: tl.constexpr):
 
 @jit
 def store_sums(to, s, GATED: tl.constexpr):
-    """Stores the sums over the warp of each lane's twelve numbers, added in a fixed order; GATED: and of a thirteenth.
+    """Store the sums over the warp of each lane's twelve numbers, added in a fixed order; GATED: and of a thirteenth.
 
     Every exchange between lanes halves how many numbers a lane still holds. This takes 13 exchanges, or 15; summing
     each number alone would take 60."""
@@ -212,7 +212,7 @@ def blend_tiles_backward(
     v_rgb, v_transmittance, v_depth_sum, slots, width, height, tiles_x, part_count, alpha_max,
     DEPTH: tl.constexpr, ABSOLUTE: tl.constexpr, TOGETHER: tl.constexpr, GATED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the slots of all pairs of one tile, or (TOGETHER) of one part of a tile.
+    """Write the slots of all pairs of one tile, or (TOGETHER) of one part of a tile.
 
     ABSOLUTE: the absolute gradients as well; DEPTH: v_depth_sum is given; GATED: rows have gates, slots
     also the sums for these.

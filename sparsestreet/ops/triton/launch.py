@@ -26,7 +26,7 @@ _INTERPRETED = triton.knobs.runtime.interpret
 
 
 def jit(function: Callable, **options: Any) -> KernelInterface:
-    """Applies triton.jit to the bare function, because a type checker wrapped around it would hide its globals.
+    """Apply triton.jit to the bare function, because a type checker wrapped around it would hide its globals.
 
     Counts that change between renderings belong in ``do_not_specialize``. Otherwise the compiler makes one kernel for
     multiples of 16, one for 1 and one for the rest.
@@ -88,7 +88,7 @@ def launch(
     options: dict[str, Any] | None = None,
     **constants: Any,
 ) -> None:
-    """Runs ``kernel`` over ``items`` in programs of ``block``, passed as BLOCK; without items nothing runs.
+    """Run ``kernel`` over ``items`` in programs of ``block``, passed as BLOCK; without items nothing runs.
 
     ``arguments`` are tensors of one device, at least one, and then numbers. ``constants`` are the kernel's other
     constants, ``options`` those of the compiler (num_warps, maxnreg, enable_fp_fusion). Raises TypeError for arguments

@@ -206,7 +206,7 @@ def list_pairs(
     records, order, unsorted_rows, counts, ends, rows, keys, pair_rows, room, width, height, tiles_x,
     BOUNDED: tl.constexpr, LANES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the rows in the ``order`` of their depths. Then the tile of each pair, and its row with the quadrants it
+    """Write the rows in the ``order`` of their depths. Then the tile of each pair, and its row with the quadrants it
     touches (quadrants.py).
 
     Pair i of a row lies in the i-th tile of its splat, counted along rows of tiles. Giants get a warp each, so that no
@@ -245,7 +245,7 @@ def list_rows(records: Tensor, tile_counts: Tensor, sums: Tensor, room: Room, vi
 
 
 def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) -> Lists:
-    """Sorts rows and pairs, which fit the room.
+    """Sort rows and pairs, which fit the room.
 
     The device has nothing else to do, so every host call between two of our kernels is a gap.
     """
@@ -275,7 +275,7 @@ def list_tiles(records: Tensor, visible: Visible, room: Room, view: KernelView) 
 
 
 def check_pairs(pairs: int, tile_counts: Tensor) -> None:
-    """Raises PairLimitError, naming the rows with most tiles, before anything of that size is allocated."""
+    """Raise PairLimitError, naming the rows with most tiles, before anything of that size is allocated."""
     if pairs <= PAIR_LIMIT:
         return
     most = torch.sort(tile_counts, descending=True, stable=True)

@@ -62,7 +62,7 @@ class Sizes:
 
 @jit
 def store_sizes(sizes, pairs, rows, bad, fits):
-    """Writes the numbers; all 64 bits wide, because pairs are counted before they are known to be few enough."""
+    """Write the numbers; all 64 bits wide, because pairs are counted before they are known to be few enough."""
     tl.store(sizes, pairs)
     tl.store(sizes + 1, rows)
     tl.store(sizes + 2, bad)

@@ -50,7 +50,7 @@ def compose(
     lasts: Int[Tensor, "h w"] | None = None,
     split: Split | None = None,
 ) -> Float[Tensor, "h w"]:
-    """Returns alpha; puts the background behind ``rgb`` and turns ``depth_sum`` into a depth, both in place.
+    """Return alpha; put the background behind ``rgb`` and turn ``depth_sum`` into a depth, both in place.
 
     The pixels of ``split`` tiles it first adds up from their parts, with where they end if ``lasts`` are given."""
     alpha, (height, width) = transmittance.new_empty(transmittance.shape), transmittance.shape

@@ -325,7 +325,7 @@ def project_rows(
     BOUNDED: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, COLUMNS: tl.constexpr,
     DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Writes the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
+    """Write the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
     ``numbers`` [3 programs]: each program's count of pairs, then of rows with tiles, then of bad rows. Comparisons are
     written so that NaN culls.

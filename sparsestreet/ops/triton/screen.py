@@ -58,7 +58,7 @@ class Screen:
 
 
 def project(gaussians: Gaussians, view: KernelView) -> Screen:
-    """Projects and lists all rows; waits for the device in between, for the numbers of rows and of pairs.
+    """Project and list all rows; waits for the device in between, for the numbers of rows and of pairs.
 
     Raises ValueError for bad values, PairLimitError.
     """
@@ -93,7 +93,7 @@ def draw(
 
 
 def project_all(gaussians: Gaussians, view: KernelView, gates: Float[Tensor, " n"] | None = None) -> Projection:
-    """Projects all rows, as if their gates were 1, and puts the gates into the records."""
+    """Project all rows, as if their gates were 1, and put the gates into the records."""
     fields, displacements = fields_of(gaussians), contiguous(gaussians.displacements)
     means, sh = fields[0], fields[4]
     n, settings, table = len(gaussians), view.settings, view.table(means.device)
@@ -137,7 +137,7 @@ def wait_for(numbers: HostCopy) -> list[int]:
 
 
 def read(sizes: Sizes, counted: HostCopy, gaussians: Gaussians, projection: Projection) -> None:
-    """Waits for the sizes; raises what ``project`` raises."""
+    """Wait for the sizes; raises what ``project`` raises."""
     pairs, rows, bad = wait_for(counted)[:COUNTED]
     if bad:
         check_values(gaussians)

@@ -110,27 +110,27 @@ class GradientDensity(DensityStrategy):
         return self.grow(rows, wanted & split, wanted & clone, generator)
 
     def urgency(self, statistics: DensityStatistics) -> Float[Tensor, " n"]:
-        """Returns how much detail the image asks of each row; rows above 1 are cloned or split, the highest first."""
+        """Return how much detail the image asks of each row; rows above 1 are cloned or split, the highest first."""
         return statistics.mean_gradients() / self.grad_threshold
 
     def split_size(self, rows: Rows, radius: float) -> float | Float[Tensor, " n"]:
-        """Returns the largest scale, meters, up to which a row is cloned."""
+        """Return the largest scale, meters, up to which a row is cloned."""
         return self.split_scale * radius
 
     def cull_size(self, rows: Rows, radius: float) -> float | Float[Tensor, " n"]:
-        """Returns the largest scale, meters, that a row may have late in a run."""
+        """Return the largest scale, meters, that a row may have late in a run."""
         return self.cull_scale * radius
 
     def decisions(
         self, rows: Rows, statistics: DensityStatistics, large: Bool[Tensor, " n"]
     ) -> tuple[Bool[Tensor, " n"], Bool[Tensor, " n"]]:
-        """Returns which rows are split and which are cloned if they grow; ``large``: those above ``split_size``."""
+        """Return which rows are split and which are cloned if they grow; ``large``: those above ``split_size``."""
         return large, ~large
 
     def grow(
         self, rows: Rows, split: Bool[Tensor, " n"], clone: Bool[Tensor, " n"], generator: torch.Generator
     ) -> RowPlan:
-        """Returns the plan that splits and clones the given rows; the children come last.
+        """Return the plan that splits and clones the given rows; the children come last.
 
         A row of both kinds shrinks first, and is cloned as it is then.
         """
@@ -181,7 +181,7 @@ class GradientDensity(DensityStrategy):
 def outside_boxes(
     means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], sizes: Float[Tensor, "i 3"], margin: float
 ) -> Bool[Tensor, " n"]:
-    """Returns whether each row's center lies more than ``margin`` meters outside the box of its instance.
+    """Return whether each row's center lies more than ``margin`` meters outside the box of its instance.
 
     ``means`` are in the frame of the box, meters. ``sizes`` are length, width and height of each instance's box, which
     is centered at the origin.
@@ -212,7 +212,7 @@ def _within_cap(
     settings: GradientDensity,
     max_gaussians: int | None,
 ) -> Bool[Tensor, " n"]:
-    """Returns the rows that may grow under the cap: most urgent first, ties by row, until one has no room."""
+    """Return the rows that may grow under the cap: most urgent first, ties by row, until one has no room."""
     if max_gaussians is None:
         return torch.ones_like(wanted)
     split_growth = settings.split_children if settings.keep_parent else settings.split_children - 1
@@ -225,7 +225,7 @@ def _within_cap(
 
 
 def _offsets(rows: Rows, children: Int[Tensor, " c"], generator: torch.Generator) -> Float[Tensor, "c 3"]:
-    """Returns one draw from each listed row's Gaussian, relative to its mean, meters."""
+    """Return one draw from each listed row's Gaussian, relative to its mean, meters."""
     scales = rows.log_scales.detach()[children].exp()
     # Draw on the generator's device, because a CPU generator gives the same children on every device.
     normal = torch.randn(scales.shape, dtype=scales.dtype, generator=generator, device=generator.device)

@@ -57,7 +57,7 @@ class McmcDensity(GradientDensity):
         max_gaussians: int | None,
         generator: torch.Generator,
     ) -> RowPlan:
-        """Gives every dead row, and every row by which the node grows, the place of a live one.
+        """Give every dead row, and every row by which the node grows, the place of a live one.
 
         The live ones are drawn in proportion to their opacity, with replacement. The N rows that then share a place
         get the opacity and scale of ``shared``, so that together they look like the one before. All of them start with
@@ -78,15 +78,15 @@ class McmcDensity(GradientDensity):
         return RowPlan(len(rows), source, fresh=counts > 1, edits={"opacity_logits": logits, "log_scales": log_scales})
 
     def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
-        """Returns the plan that keeps all rows."""
+        """Return the plan that keeps all rows."""
         return RowPlan.keep(torch.ones(len(rows), dtype=torch.bool, device=rows.means.device))
 
     def reset(self, rows: Rows) -> RowPlan:
-        """Returns the plan that keeps all rows as they are."""
+        """Return the plan that keeps all rows as they are."""
         return RowPlan.keep(torch.ones(len(rows), dtype=torch.bool, device=rows.means.device))
 
     def noise(self, rows: Rows, rate: float, seed: int) -> Float[Tensor, "n 3"]:
-        """Returns lambda_lr lambda_noise sigmoid(-k (o - t)) Sigma eta with eta ~ N(0, I), meters.
+        """Return lambda_lr lambda_noise sigmoid(-k (o - t)) Sigma eta with eta ~ N(0, I), meters.
 
         lambda_lr is the ``rate`` of the means, t the opacity of a dead row.
         """
@@ -100,7 +100,7 @@ class McmcDensity(GradientDensity):
         return rate * self.noise_rate * faint[:, None] * spread.squeeze(-1)
 
     def regularizers(self, rows: Rows) -> Mapping[str, Float[Tensor, ""]]:
-        """Returns lambda_o times the mean opacity and lambda_Sigma times the mean scale.
+        """Return lambda_o times the mean opacity and lambda_Sigma times the mean scale.
 
         The paper writes sums, which with its weights would outweigh every image.
         """
@@ -115,7 +115,7 @@ class McmcDensity(GradientDensity):
 def shared(
     logits: Float[Tensor, " n"], log_scales: Float[Tensor, "n 3"], counts: Int[Tensor, " n"]
 ) -> tuple[Float[Tensor, " n"], Float[Tensor, "n 3"]]:
-    """Returns opacity logits and logarithmic scales of N = ``counts`` equal rows that together look like one.
+    """Return opacity logits and logarithmic scales of N = ``counts`` equal rows that together look like one.
 
     o' = 1 - (1 - o)^(1 / N), and the scales are multiplied by o / D with::
 
@@ -149,7 +149,7 @@ _NODES = 161
 
 
 def _drawn(weights: Float[Tensor, " n"], number: int, generator: torch.Generator) -> Int[Tensor, " m"]:
-    """Returns ``number`` rows, drawn with replacement in proportion to their weights (torch's own takes 2^24 at most).
+    """Return ``number`` rows, drawn with replacement in proportion to their weights (torch's own takes 2^24 at most).
 
     Drawn on the generator's device, so that a CPU generator gives the same rows on every device.
     """

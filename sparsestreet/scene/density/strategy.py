@@ -58,7 +58,7 @@ class DensityStatistics:
         height: int,
         gradients: Mapping[str, Float[Tensor, " n"]] | None = None,
     ) -> None:
-        """Adds one view after its backward pass; rows with radius 0 were not drawn and do not change,
+        """Add one view after its backward pass; rows with radius 0 were not drawn and do not change,
         nor do those whose gradient is not finite.
 
         ``screen_gradient`` is the absolute gradient of the loss per pixel of the projected mean
@@ -83,7 +83,7 @@ class DensityStatistics:
             total += torch.where(drawn & (absolute < torch.inf), absolute, 0.0)
 
     def mean_gradients(self, column: str | None = None) -> Float[Tensor, " n"]:
-        """Returns the mean norm on screen over the visits, or the mean absolute gradient of a watched column.
+        """Return the mean norm on screen over the visits, or the mean absolute gradient of a watched column.
 
         Rows that were never drawn have 0. Raises ValueError if a sum is NaN or infinite.
         """
@@ -97,19 +97,19 @@ class DensityStatistics:
         return total / self.visits.clamp(min=1)
 
     def total(self, ranks: Ranks) -> None:
-        """Takes in what the other processes have seen, so that all decide alike."""
+        """Take in what the other processes have seen, so that all decide alike."""
         for values in (self.gradient_sum, self.visits, *self.watched.values()):
             ranks.sum(values)
         ranks.largest(self.largest_screen)
 
     def absorb(self, other: "DensityStatistics") -> None:
-        """Adds what other statistics of the same rows have seen."""
+        """Add what other statistics of the same rows have seen."""
         self.gradient_sum, self.visits = self.gradient_sum + other.gradient_sum, self.visits + other.visits
         self.largest_screen = torch.maximum(self.largest_screen, other.largest_screen)
         self.watched = {name: values + other.watched[name] for name, values in self.watched.items()}
 
     def resize(self, plan: RowPlan) -> None:
-        """Applies the plan of the node's rows; fresh rows start at zero."""
+        """Apply the plan of the node's rows; fresh rows start at zero."""
         self._each(lambda values: values[plan.source].masked_fill(plan.fresh, 0))
 
     def reset(self) -> None:
@@ -118,16 +118,16 @@ class DensityStatistics:
         self.is_empty = True
 
     def to(self, device: torch.device) -> None:
-        """Moves the accumulators to the device of the rows."""
+        """Move the accumulators to the device of the rows."""
         self._each(lambda values: values.to(device))
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns the state for a checkpoint; a run resumed between refinements densifies like an uninterrupted one."""
+        """Return the state for a checkpoint; a run resumed between refinements densifies like an uninterrupted one."""
         return vars(self) | {"watched": dict(self.watched)}
 
     @staticmethod
     def from_state(state: Mapping[str, Any]) -> "DensityStatistics":
-        """Returns the statistics of a checkpoint, with its number of rows."""
+        """Return the statistics of a checkpoint, with its number of rows."""
         statistics = DensityStatistics(0)
         vars(statistics).update(state)
         statistics._each(torch.clone)
@@ -161,24 +161,24 @@ class DensityStrategy(Protocol):
         max_gaussians: int | None,
         generator: torch.Generator,
     ) -> RowPlan:
-        """Returns the plan that clones and splits rows; the table never grows beyond ``max_gaussians``."""
+        """Return the plan that clones and splits rows; the table never grows beyond ``max_gaussians``."""
         ...
 
     def cull(self, rows: Rows, statistics: DensityStatistics, *, radius: float, progress: float) -> RowPlan:
-        """Returns the plan that drops useless rows."""
+        """Return the plan that drops useless rows."""
         ...
 
     def reset(self, rows: Rows) -> RowPlan:
-        """Returns the plan that lowers opacities; needed rows grow back, and the others stay faint."""
+        """Return the plan that lowers opacities; needed rows grow back, and the others stay faint."""
         ...
 
     def noise(self, rows: Rows, rate: float, seed: int) -> Float[Tensor, "n 3"] | None:
-        """Returns what is added to the means after a step; None: nothing.
+        """Return what is added to the means after a step; None: nothing.
 
         ``rate`` is the means' learning rate of the step, and ``seed`` differs from step to step.
         """
         return None
 
     def regularizers(self, rows: Rows) -> Mapping[str, Float[Tensor, ""]]:
-        """Returns terms of the loss that the strategy needs, by name, each with its weight."""
+        """Return terms of the loss that the strategy needs, by name, each with its weight."""
         return {}

@@ -16,7 +16,7 @@ from sparsestreet.scene.gaussians import RowPlan, Rows
 
 
 def displacements(velocities: Float[Tensor, "n 3"], ages: Float[Tensor, " n"], cycle: float) -> Float[Tensor, "n 3"]:
-    """Returns v sin(age a) / a with a = 2 pi / cycle, meters. The Gaussian moves with v at its life peak, never far.
+    """Return v sin(age a) / a with a = 2 pi / cycle, meters. The Gaussian moves with v at its life peak, never far.
 
     >>> displacements(torch.tensor([[2.0, 0.0, 0.0]]), torch.tensor([0.0]), cycle=0.2).tolist()
     [[0.0, 0.0, 0.0]]
@@ -28,7 +28,7 @@ def displacements(velocities: Float[Tensor, "n 3"], ages: Float[Tensor, " n"], c
 def mean_velocities(
     velocities: Float[Tensor, "n 3"], log_life_spans: Float[Tensor, " n"], cycle: float
 ) -> Float[Tensor, "n 3"]:
-    """Returns v exp(-rho / 2) with the staticness rho = life span / cycle; a Gaussian of many swings goes nowhere.
+    """Return v exp(-rho / 2) with the staticness rho = life span / cycle; a Gaussian of many swings goes nowhere.
 
     >>> mean_velocities(torch.tensor([[2.0, 0.0, 0.0]]), torch.tensor([-100.0]), cycle=0.2).tolist()
     [[2.0, 0.0, 0.0]]
@@ -37,7 +37,7 @@ def mean_velocities(
 
 
 def faded_logits(opacity_logits: Float[Tensor, " n"], log_factors: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-    """Returns the logit of sigmoid(logit) exp(log_factor), for log factors <= 0; exact if the product is close to 1.
+    """Return the logit of sigmoid(logit) exp(log_factor), for log factors <= 0; exact if the product is close to 1.
 
     >>> torch.sigmoid(faded_logits(torch.zeros(1), torch.tensor([0.5]).log())).tolist()
     [0.25]
@@ -89,7 +89,7 @@ class VibratingDensity(GradientDensity):
     def grow(
         self, rows: Rows, split: Bool[Tensor, " n"], clone: Bool[Tensor, " n"], generator: torch.Generator
     ) -> RowPlan:
-        """Returns the plan of 3DGS with children spread over time, whether they were split in space or in time.
+        """Return the plan of 3DGS with children spread over time, whether they were split in space or in time.
 
         Children peak at tau + s z, z ~ N(0, 1), where s is their parent's life span. They are moved to that time by the
         parent's mean velocity, and live as long as the parent (``no_time_split`` of DriveStudio). As there, parent and
@@ -111,7 +111,7 @@ class VibratingDensity(GradientDensity):
 
 
 def _lengths(rows: Rows, radius: float) -> Float[Tensor, " n"]:
-    """Returns max(d R - 1, 1), which stands for the scene radius in sizes of rows."""
+    """Return max(d R - 1, 1), which stands for the scene radius in sizes of rows."""
     means = rows.means.detach()
     distances = (means - means.quantile(0.5, dim=0)).norm(dim=1) if len(rows) else means.new_zeros(0)
     return (distances * radius - 1).clamp(min=1)

@@ -116,7 +116,7 @@ class EffectSettings(ABC):
         return Cost()
 
     def prepare(self, nodes: Iterable[Node], on: bool) -> None:
-        """Tells nodes that are built what the plan says, where the effect is a matter of theirs; by default nothing."""
+        """Tell nodes that are built what the plan says, where the effect is a matter of theirs; by default nothing."""
         return None
 
     @abstractmethod

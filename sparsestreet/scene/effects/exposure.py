@@ -69,7 +69,7 @@ class ExposureSettings(EffectSettings):
         return Cost(numbers=3 * len(data.views), ns_per_pixel=3.3)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Exposure":
-        """Starts from the gains that are measured on all images; from none where nothing can be measured."""
+        """Start from the gains that are measured on all images; from none where nothing can be measured."""
         made = Exposure(self, _times(data.views))
         gains = _measured(data, most=None)
         if gains is not None:
@@ -103,7 +103,7 @@ class Exposure(Effect):
 
     @torch.no_grad()
     def start_from(self, views: Sequence[View], log_gains: Float[Tensor, "n 3"]) -> None:
-        """Sets the gains of training views."""
+        """Set the gains of training views."""
         for view, gain in zip(views, log_gains, strict=True):
             _, camera = view.indices
             self.log_gains[self._first[camera] + bisect_left(self.times[camera], view.time)] = gain.to(self.log_gains)
@@ -140,7 +140,7 @@ class Exposure(Effect):
         return factor.expand(view.camera.height, view.camera.width)
 
     def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:
-        """Returns ``smooth``, for a training image between two others of its camera, and ``level``."""
+        """Return ``smooth``, for a training image between two others of its camera, and ``level``."""
         terms = {}
         if self.settings.level > 0:
             terms["level"] = self.settings.level * self.log_gains.mean(0).square().sum()
@@ -252,7 +252,7 @@ class Affine(Effect):
         self.deltas = nn.Parameter(torch.zeros(3, 4))
 
     def matrix(self) -> Float[Tensor, "3 3"]:
-        """Returns A."""
+        """Return A."""
         return self.deltas[:, :3] + torch.eye(3, dtype=self.deltas.dtype, device=self.deltas.device)
 
     def image(
@@ -269,7 +269,7 @@ class Affine(Effect):
         return (self.matrix().norm() / 3**0.5).expand(view.camera.height, view.camera.width)
 
     def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:
-        """Returns ``identity`` and ``decay``, those that have a weight."""
+        """Return ``identity`` and ``decay``, those that have a weight."""
         settings, terms = self.settings, {}
         if settings.weight > 0:
             terms["identity"] = settings.weight * (self.deltas[:, :3].abs().mean() + self.deltas[:, 3].abs().mean())

@@ -166,7 +166,7 @@ class CameraPosesSettings(EffectSettings):
             raise ValueError(f"weight and threshold must be >= 0, got {self.weight} and {self.threshold}")
 
     def detect(self, data: TrainingData) -> Finding:
-        """Measures images of a few stretches of the drive (``evidence.poses``)."""
+        """Measure images of a few stretches of the drive (``evidence.poses``)."""
         found = pose_noise(data.frames, _moving(data))
         if found is None:
             reason = f"no image of {data.log.name} shares enough points with others to tell whether its pose is off"
@@ -297,7 +297,7 @@ class CameraPoses(Effect):
         return self.start + self.expected[:, None] * torch.cat((_DEPTH * self.translations, self.rotations), 1)
 
     def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:
-        """Returns ``correction``, of the view's own pose, where it has a weight and the view is a training image."""
+        """Return ``correction``, of the view's own pose, where it has a weight and the view is a training image."""
         place = self.recorded.place(view)
         if place is None or not self.settings.weight > 0:
             return {}

@@ -36,11 +36,11 @@ class Points:
         return Points(self.positions[mask], self.colors[mask])
 
     def at(self, rows: Int[Tensor, " k"]) -> "Points":
-        """Returns the points of some rows, in that order."""
+        """Return the points of some rows, in that order."""
         return Points(self.positions[rows], self.colors[rows])
 
     def sampled(self, limit: int, generator: torch.Generator) -> "Points":
-        """Returns at most ``limit`` of the points, drawn without replacement."""
+        """Return at most ``limit`` of the points, drawn without replacement."""
         return self.at(at_most(limit, torch.arange(len(self)), generator))
 
     @staticmethod
@@ -53,7 +53,7 @@ class Points:
 
 
 def at_most(limit: int, rows: Int[Tensor, " n"], generator: torch.Generator) -> Int[Tensor, " k"]:
-    """Returns all rows if there are at most ``limit``, else ``limit`` of them, drawn without replacement.
+    """Return all rows if there are at most ``limit``, else ``limit`` of them, drawn without replacement.
 
     >>> len(at_most(2, torch.arange(5), torch.Generator().manual_seed(0)))
     2
@@ -62,7 +62,7 @@ def at_most(limit: int, rows: Int[Tensor, " n"], generator: torch.Generator) -> 
 
 
 def thinned(positions: Float[Tensor, "n 3"], voxel: float, generator: torch.Generator) -> Int[Tensor, " k"]:
-    """Returns the rows of one random point of each cube with side ``voxel`` meters, in random order.
+    """Return the rows of one random point of each cube with side ``voxel`` meters, in random order.
 
     >>> positions = torch.tensor([[0.1, 0.0, 0.0], [0.2, 0.0, 0.0], [1.5, 0.0, 0.0]])
     >>> len(thinned(positions, 1.0, torch.Generator().manual_seed(0)))
@@ -77,13 +77,13 @@ def thinned(positions: Float[Tensor, "n 3"], voxel: float, generator: torch.Gene
 
 
 def returns_in_box_frame(track: Track, sweep: Sweep) -> Float[Tensor, "n 3"] | None:
-    """Returns a sweep in the track's box frame at its time, meters; None if the track has no box in its frame."""
+    """Return a sweep in the track's box frame at its time, meters; None if the track has no box in its frame."""
     world_from_object = box_at(track, sweep.index, sweep.time)
     return None if world_from_object is None else _in_frame(world_from_object, sweep.points)
 
 
 def outside_boxes(tracks: Sequence[Track], sweep: Sweep, enlargement: float) -> Bool[Tensor, " n"]:
-    """Returns whether the points of a sweep lie in none of the tracks' boxes at its time."""
+    """Return whether the points of a sweep lie in none of the tracks' boxes at its time."""
     outside = torch.ones(sweep.points.shape[0], dtype=torch.bool)
     for track in tracks:
         in_box_frame = returns_in_box_frame(track, sweep)
@@ -95,7 +95,7 @@ def outside_boxes(tracks: Sequence[Track], sweep: Sweep, enlargement: float) -> 
 def outside_swept_boxes(
     tracks: Sequence[Track], points: Float[Tensor, "n 3"], held_out: frozenset[int] = frozenset()
 ) -> Bool[Tensor, " n"]:
-    """Returns whether world points lie in none of the tracks' boxes at any frame, those held out left aside."""
+    """Return whether world points lie in none of the tracks' boxes at any frame, those held out left aside."""
     outside = torch.ones(points.shape[0], dtype=torch.bool)
     for track in tracks:
         centers = track.world_from_object[:, :3, 3].to(points.dtype)
@@ -109,7 +109,7 @@ def outside_swept_boxes(
 
 
 def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Returns random points on the faces of a box about the origin, spread evenly over its area.
+    """Return random points on the faces of a box about the origin, spread evenly over its area.
 
     >>> size = torch.tensor([4.0, 2.0, 1.5])
     >>> points = box_surface_points(10, size, torch.Generator().manual_seed(0))
@@ -126,7 +126,7 @@ def box_surface_points(count: int, size: Float[Tensor, "3"], generator: torch.Ge
 
 
 def lidar_in_boxes(tracks: Sequence[Track], sweeps: Iterable[Sweep]) -> list[Points]:
-    """Returns for each object the colored returns inside its box at their own instant, in the box frame.
+    """Return for each object the colored returns inside its box at their own instant, in the box frame.
 
     It passes once over the sweeps, which may be read from disk on the way.
     """
@@ -222,7 +222,7 @@ FLAT = 0.01
 
 
 def neighbor_scales(points: Float[Tensor, "n 3"]) -> Float[Tensor, " n"]:
-    """Returns the mean distance to the three nearest other points (or fewer if there are fewer), at least 1 mm.
+    """Return the mean distance to the three nearest other points (or fewer if there are fewer), at least 1 mm.
 
     A point without any neighbor gets 1 mm.
 
@@ -252,7 +252,7 @@ def init_gaussians(
     mask_columns: Mapping[str, Tensor] | None = None,
     buffers: Mapping[str, Tensor] | None = None,
 ) -> Rows:
-    """Returns isotropic Gaussians with random rotations (as in 3DGS), one per point; RGB in [0, 1], scales in meters.
+    """Return isotropic Gaussians with random rotations (as in 3DGS), one per point; RGB in [0, 1], scales in meters.
 
     ``columns`` are further parameters of a node, ``mask_columns`` those that a mask learns, ``buffers`` further data of
     each row. Raises ValueError if an opacity is outside (0, 1) or the degree outside 0 to 3.
@@ -283,7 +283,7 @@ def init_gaussians(
 
 @torch.no_grad()
 def lie_flat(rows: Rows, normals: Float[Tensor, "n 3"]) -> None:
-    """Turns the third axis of each Gaussian into its normal and makes it thin there; NaN: it stays as it is.
+    """Turn the third axis of each Gaussian into its normal and make it thin there; NaN: it stays as it is.
 
     The rotation is the shortest one from (0, 0, 1), so normals point up: z must not be negative.
     """

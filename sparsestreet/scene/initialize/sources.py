@@ -77,14 +77,14 @@ class PointSource(ABC):
 
     @abstractmethod
     def share(self, coverage: Coverage) -> float:
-        """Returns the fraction of the node's points that the source is asked for if it has no ``number``.
+        """Return the fraction of the node's points that the source is asked for if it has no ``number``.
 
         The fractions of a node's sources add up to 1 at most; the rest of the points is left out.
         """
 
     @abstractmethod
     def draw(self, count: int, data: TrainingData, generator: torch.Generator) -> Seeds:
-        """Returns ``count`` points, or all points if there are fewer."""
+        """Return ``count`` points, or all points if there are fewer."""
 
     def seeds(
         self,
@@ -94,7 +94,7 @@ class PointSource(ABC):
         times: Float[Tensor, " n"] | None = None,
         normals: Float[Tensor, "n 3"] | None = None,
     ) -> Seeds:
-        """Returns seeds with the source's opacity; limits of the scale are meters (None: no limit on that side),
+        """Return seeds with the source's opacity; limits of the scale are meters (None: no limit on that side),
         ``times`` are normalized times of measurement, ``normals`` those of surfaces (None: unknown)."""
         count = len(points)
         return Seeds(
@@ -108,7 +108,7 @@ class PointSource(ABC):
 
 
 def check_positive(**values: float | None) -> None:
-    """Raises ValueError for a setting that is not above 0; None passes."""
+    """Raise ValueError for a setting that is not above 0; None passes."""
     for name, value in values.items():
         if value is not None and not value > 0:
             raise ValueError(f"{name} must be larger than 0, got {value}")
@@ -169,7 +169,7 @@ class Guesses(PointSource):
     def positions(
         self, count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"]:
-        """Returns ``count`` random positions in a scene with this center and radius, meters."""
+        """Return ``count`` random positions in a scene with this center and radius, meters."""
 
 
 def random_points(
@@ -180,7 +180,7 @@ def random_points(
     frames: Sequence[Frame],
     generator: torch.Generator,
 ) -> Points:
-    """Returns ``count`` points of the distribution ``draw`` that the frames see; fewer if they see too little of it."""
+    """Return ``count`` points of the distribution ``draw`` that the frames see; fewer if they see too little of it."""
     found = Points.concatenate([])
     for _ in range(ROUNDS):
         if len(found) >= count:
@@ -192,7 +192,7 @@ def random_points(
 
 
 def seen_points(positions: Float[Tensor, "n 3"], frames: Iterable[Frame]) -> Points:
-    """Returns the positions that the first view looking at them does not show as sky, with their color in that view.
+    """Return the positions that the first view looking at them does not show as sky, with their color in that view.
 
     A ray that ends in the sky meets nothing, so a Gaussian on it could only learn to vanish. Without sky masks every
     position inside some view is kept. A view does not look at what the recording car hides.
@@ -209,7 +209,7 @@ def seen_points(positions: Float[Tensor, "n 3"], frames: Iterable[Frame]) -> Poi
 
 
 def in_some_view(positions: Float[Tensor, "n 3"], views: Iterable[View]) -> Float[Tensor, "k 3"]:
-    """Returns the positions that lie inside the image of at least one view, in their order."""
+    """Return the positions that lie inside the image of at least one view, in their order."""
     unseen = torch.arange(len(positions))
     for view in views:
         _, _, inside = project(view.camera, positions[unseen])
@@ -220,7 +220,7 @@ def in_some_view(positions: Float[Tensor, "n 3"], views: Iterable[View]) -> Floa
 
 
 def directions(count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
-    """Returns unit vectors, uniform on the sphere.
+    """Return unit vectors, uniform on the sphere.
 
     >>> directions(3, torch.Generator().manual_seed(0)).norm(dim=1).round(decimals=3).tolist()
     [1.0, 1.0, 1.0]
@@ -229,7 +229,7 @@ def directions(count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
 
 
 def _camera_distances(positions: Float[Tensor, "n 3"], views: Sequence[View]) -> Float[Tensor, " n"]:
-    """Returns the distance to the nearest camera, meters."""
+    """Return the distance to the nearest camera, meters."""
     cameras = torch.stack([view.camera.position for view in views]).double().numpy()
     distances, _ = KDTree(cameras).query(positions.double().numpy())
     return torch.from_numpy(distances).float()
@@ -246,7 +246,7 @@ class FarPoints(Guesses):
     def positions(
         self, count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"]:
-        """Returns points in uniform directions at distance radius / u; density falls with distance.
+        """Return points in uniform directions at distance radius / u; density falls with distance.
 
         u is uniform in [FARTHEST_RATIO, 1]. If ``blind``, it is uniform in [0, 1] and clamped, as in DriveStudio.
         """
@@ -324,7 +324,7 @@ class ImagePoints(PointSource):
 
 
 def pixel_sizes(positions: Float[Tensor, "n 3"], views: Sequence[View]) -> Float[Tensor, " n"]:
-    """Returns the sizes of a pixel at some points, meters, as the nearest camera sees them."""
+    """Return the sizes of a pixel at some points, meters, as the nearest camera sees them."""
     cameras = torch.stack([view.camera.position for view in views]).double().numpy()
     focal = torch.tensor([float(view.camera.intrinsics[0, 0]) for view in views])
     distances, nearest = KDTree(cameras).query(positions.double().numpy())
@@ -378,6 +378,6 @@ class NearPoints(Guesses):
     def positions(
         self, count: int, center: Float[Tensor, "3"], radius: float, generator: torch.Generator
     ) -> Float[Tensor, "n 3"]:
-        """Returns points that are uniform in the ball."""
+        """Return points that are uniform in the ball."""
         distance = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)
         return center + distance * directions(count, generator)

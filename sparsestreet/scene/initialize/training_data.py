@@ -75,7 +75,7 @@ class Coverage:
 
 
 def coverage(data: TrainingData) -> Coverage:
-    """Returns the coverage of training views; "near" is the window of ``near_returns``. No pixels: all is uncovered."""
+    """Return the coverage of training views; "near" is the window of ``near_returns``. No pixels: all is uncovered."""
     static = None if data.image_points is None else data.image_points.static
     sparse = None if data.log.sparse_points is None else data.log.sparse_points()
     pixels = by_lidar = by_images = 0
@@ -95,7 +95,7 @@ def coverage(data: TrainingData) -> Coverage:
 
 
 def beyond_lidar(data: TrainingData, points: TriangulatedPoints) -> Bool[Tensor, " n"]:
-    """Returns whether no view that shows a point has a return near it."""
+    """Return whether no view that shows a point has a return near it."""
     seen_near = torch.zeros(len(points), dtype=torch.bool)
     for place in range(len(data.frames)):
         own = points.views == place
@@ -120,6 +120,6 @@ def _near_points(points: TriangulatedPoints, place: int, frame: Frame) -> Bool[T
 def _shown_at(
     points: TriangulatedPoints, observations: Bool[np.ndarray, " o"]
 ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
-    """Returns row and column of the pixels of some observations."""
+    """Return row and column of the pixels of some observations."""
     column, row = torch.from_numpy(points.pixels[observations]).long().unbind(1)
     return row, column

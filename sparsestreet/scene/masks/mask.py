@@ -34,17 +34,17 @@ class Mask(nn.Module, ABC):
 
     @abstractmethod
     def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
-        """Returns the mask's columns for a new table."""
+        """Return the mask's columns for a new table."""
 
     @abstractmethod
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
-        """Returns M in {0, 1} of every row at a normalized time, with a straight-through gradient.
+        """Return M in {0, 1} of every row at a normalized time, with a straight-through gradient.
 
         Opacity and scale are multiplied by it.
         """
 
     def gates(self, rows: Rows, step: int) -> Float[Tensor, " n"] | None:
-        """Returns a factor in {0, 1} of each row's alpha in a training step, for masks that sample; None: 1.
+        """Return a factor in {0, 1} of each row's alpha in a training step, for masks that sample; None: 1.
 
         Unlike a multiplier, a gate of 0 leaves the row in the lists of the op, so that its gradient exists
         (``ops.splat``).
@@ -53,7 +53,7 @@ class Mask(nn.Module, ABC):
 
     @abstractmethod
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Returns the sum of scores that the sparsity loss lowers; the view at ``time`` draws the ``visible`` rows."""
+        """Return the sum of scores that the sparsity loss lowers; the view at ``time`` draws the ``visible`` rows."""
 
     @abstractmethod
     def keep(self, rows: Rows) -> Selection:
@@ -61,7 +61,7 @@ class Mask(nn.Module, ABC):
 
     @abstractmethod
     def finish(self, rows: Rows) -> "tuple[Mask | None, dict[str, Tensor]]":
-        """Returns the mask that remains after training, and the buffers of the table that it needs from then on.
+        """Return the mask that remains after training, and the buffers of the table that it needs from then on.
 
         Called when the rows that ``keep`` closes are gone. None stands for M = 1. The remaining mask has no columns.
         """
@@ -84,7 +84,7 @@ class MaskScope:
 
     @staticmethod
     def whole(times: Sequence[float], center: Float[Tensor, "3"], radius: float) -> "MaskScope":
-        """Returns one instance that fills the scene and shows at all training times.
+        """Return one instance that fills the scene and shows at all training times.
 
         >>> MaskScope.whole([0.0, 0.5, 1.0], torch.zeros(3), radius=20.0).times.tolist()
         [[0.0, 0.5, 1.0]]
@@ -98,7 +98,7 @@ class MaskSettings(Protocol):
     """The interface of a mask's settings."""
 
     def build(self, min_gaussians: int, scope: MaskScope) -> Mask:
-        """Returns a mask that never leaves fewer rows open than ``min_gaussians``, the K_min of its node."""
+        """Return a mask that never leaves fewer rows open than ``min_gaussians``, the K_min of its node."""
         ...
 
 
@@ -111,7 +111,7 @@ class BakedMaskSettings:
     """Settings of a baked mask, which has no options."""
 
     def restored(self, times: Float[Tensor, " t"]) -> "BakedMask":
-        """Returns the mask of a scene file, whose table has the bits."""
+        """Return the mask of a scene file, whose table has the bits."""
         return BakedMask(times)
 
 
@@ -143,20 +143,20 @@ class BakedMask(Mask):
         return shown.to(rows.means.dtype)
 
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Returns 0, because nothing is learned any more."""
+        """Return 0, because nothing is learned any more."""
         return rows.means.new_zeros(())
 
     def keep(self, rows: Rows) -> Selection:
-        """Keeps all rows. Those that never show were removed when the mask was finished."""
+        """Keep all rows. Those that never show were removed when the mask was finished."""
         everything = torch.ones(len(rows), dtype=torch.bool, device=rows.mask_bits.device)
         return keep_best(everything.float(), ~everything, 0)
 
     def finish(self, rows: Rows) -> tuple[Mask, dict[str, Tensor]]:
-        """Returns itself, because it is finished."""
+        """Return itself, because it is finished."""
         return self, {}
 
     def _frames_around(self, time: float) -> tuple[int, int]:
-        """Returns the frame at a time twice, or the frames before and after it."""
+        """Return the frame at a time twice, or the frames before and after it."""
         times = self.times.tolist()
         after = bisect_left(times, time - TIME_TOLERANCE)
         if after == len(times):
@@ -166,7 +166,7 @@ class BakedMask(Mask):
 
 
 def packed(shown: Bool[Tensor, "n t"]) -> UInt8[Tensor, "n b"]:
-    """Returns the bits with eight frames a byte, the first frame in the lowest bit.
+    """Return the bits with eight frames a byte, the first frame in the lowest bit.
 
     >>> packed(torch.tensor([[True, False, True]])).tolist()
     [[5]]

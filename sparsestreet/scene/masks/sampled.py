@@ -42,7 +42,7 @@ class SampledMaskSettings:
             )
 
     def build(self, min_gaussians: int, scope: MaskScope | None = None) -> "SampledMask":
-        """Returns the mask; ``scope`` has no effect, because the mask is the same at all times."""
+        """Return the mask; ``scope`` has no effect, because the mask is the same at all times."""
         return SampledMask(self, min_gaussians)
 
 
@@ -76,22 +76,22 @@ class SampledMask(Mask):
         return {COLUMN: torch.full((num_rows,), self.settings.initial_logit, dtype=torch.float32)}
 
     def probabilities(self, rows: Rows) -> Float[Tensor, " n"]:
-        """Returns sigma(m) as float32."""
+        """Return sigma(m) as float32."""
         return torch.sigmoid(rows.mask_logits.float())
 
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
-        """Returns 1: a scene that is not in a training step shows all rows, with their own opacity and scale."""
+        """Return 1: a scene that is not in a training step shows all rows, with their own opacity and scale."""
         return torch.ones_like(rows.mask_logits.detach())
 
     def gates(self, rows: Rows, step: int) -> Float[Tensor, " n"]:
-        """Returns the samples of a step; if they are fewer than K_min, the nearest to being sampled join them."""
+        """Return the samples of a step; if they are fewer than K_min, the nearest to being sampled join them."""
         self._step = step
         samples, fires = self._samples(rows)
         self.floor_firings = self.floor_firings + fires
         return samples
 
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Returns n (mean of the step's samples)^2: divided by the rows of all nodes it is the paper's (mean M)^2,
+        """Return n (mean of the step's samples)^2: divided by the rows of all nodes it is the paper's (mean M)^2,
         each node by its share of them."""
         samples, _ = self._samples(rows)
         if self.settings.visible_only:
@@ -107,7 +107,7 @@ class SampledMask(Mask):
         return keep_best(probabilities, never, self.min_gaussians)
 
     def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
-        """Returns no mask: the rows that stayed show always."""
+        """Return no mask: the rows that stayed show always."""
         return None, {}
 
     def _samples(self, rows: Rows) -> tuple[Float[Tensor, " n"], int | Bool[Tensor, ""]]:

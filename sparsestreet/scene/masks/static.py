@@ -33,7 +33,7 @@ class StaticMaskSettings:
             raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
 
     def build(self, min_gaussians: int, scope: MaskScope | None = None) -> "StaticMask":
-        """Returns the mask; ``scope`` has no effect, because the mask is the same at all times."""
+        """Return the mask; ``scope`` has no effect, because the mask is the same at all times."""
         return StaticMask(self, min_gaussians)
 
 
@@ -58,12 +58,12 @@ class StaticMask(Mask):
         return {COLUMN: torch.full((num_rows,), self.settings.initial_logit, dtype=torch.float32)}
 
     def scores(self, rows: Rows) -> Float[Tensor, " n"]:
-        """Returns sigma(m) as float32, because bfloat16 logits stop moving at -4.0, above the threshold."""
+        """Return sigma(m) as float32, because bfloat16 logits stop moving at -4.0, above the threshold."""
         with torch.autocast(rows.mask_logits.device.type, enabled=False):
             return torch.sigmoid(rows.mask_logits.float())
 
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
-        """Returns M; if fewer than K_min scores pass the threshold, the highest ones count as passing."""
+        """Return M; if fewer than K_min scores pass the threshold, the highest ones count as passing."""
         scores = self.scores(rows)
         return straight_through(scores, self._effective_threshold(scores.detach()))
 
@@ -77,11 +77,11 @@ class StaticMask(Mask):
         return keep_best(scores, scores <= self.settings.threshold, self.min_gaussians)
 
     def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
-        """Returns no mask: M = 1 for all rows that stayed."""
+        """Return no mask: M = 1 for all rows that stayed."""
         return None, {}
 
     def _effective_threshold(self, scores: Float[Tensor, " n"]) -> float | Float[Tensor, ""]:
-        """Returns the threshold, lowered if needed so that K_min (or all) rows pass; ties all pass."""
+        """Return the threshold, lowered if needed so that K_min (or all) rows pass; ties all pass."""
         threshold, floor = self.settings.threshold, min(self.min_gaussians, len(scores))
         if floor == 0:
             return threshold
@@ -111,7 +111,7 @@ def lowered_threshold(
 
 
 def straight_through(scores: Float[Tensor, " n"], threshold: float | Float[Tensor, ""]) -> Float[Tensor, " n"]:
-    """Returns 1[score > threshold] forward, d/dscore = 1 backward (the paper's M_k; Bengio et al. 2013).
+    """Return 1[score > threshold] forward, d/dscore = 1 backward (the paper's M_k; Bengio et al. 2013).
 
     Scores are sigmoids already, so this applies none.
 

@@ -107,7 +107,7 @@ class TemporalMask(Mask):
         self.draws.fill_(number)
 
     def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
-        """Returns random features of standard deviation 0.01, so that rows in one place can learn different masks.
+        """Return random features of standard deviation 0.01, so that rows in one place can learn different masks.
 
         They start equal at all times.
         """
@@ -116,7 +116,7 @@ class TemporalMask(Mask):
         return {FEATURES: features.repeat(1, self.settings.feature_times)}
 
     def scores(self, rows: Rows, times: Float[Tensor, "#n t"]) -> Float[Tensor, "n t"]:
-        """Returns sigma of every row at its times, float32 under any precision."""
+        """Return sigma of every row at its times, float32 under any precision."""
         with torch.autocast(rows.mask_features.device.type, enabled=False):
             features = self._features_at(rows.mask_features, times)
             places = self._encoded(self._places(rows))[:, None].expand(-1, features.shape[1], -1)
@@ -128,7 +128,7 @@ class TemporalMask(Mask):
     def _features_at(
         self, features: Float[Tensor, "n s"], times: Float[Tensor, "#n t"]
     ) -> Float[Tensor, "n t d"] | Float[Tensor, "n 1 d"]:
-        """Returns f_k^t, linear between the times at which features stand; one for all times if that is one."""
+        """Return f_k^t, linear between the times at which features stand; one for all times if that is one."""
         count = self.settings.feature_times
         stored = features.reshape(len(features), count, self.settings.features)
         if count == 1:
@@ -147,7 +147,7 @@ class TemporalMask(Mask):
         return multipliers
 
     def sparsity(self, rows: Rows, time: float, visible: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Returns the mean over the current time and T training frames of the row's instance, summed over rows."""
+        """Return the mean over the current time and T training frames of the row's instance, summed over rows."""
         drawn = self._drawn_frames()[_instances(rows)]
         now = drawn.new_full((len(rows), 1), time)
         scores = self.scores(rows, torch.cat((now, drawn), dim=1)).mean(1)
@@ -169,7 +169,7 @@ class TemporalMask(Mask):
 
     @torch.no_grad()
     def finish(self, rows: Rows) -> tuple[BakedMask, dict[str, Tensor]]:
-        """Returns a bit per row and training frame, over the training frames of all instances."""
+        """Return a bit per row and training frame, over the training frames of all instances."""
         times = torch.unique(self.times[self.valid])
         chunks = [self.scores(rows, part[None].expand(1, -1)) > self.limit for part in times.split(_TIMES_AT_ONCE)]
         return BakedMask(times), {BITS: packed(torch.cat(chunks, dim=1))}
@@ -179,7 +179,7 @@ class TemporalMask(Mask):
         return torch.cat([self.scores(rows, part) for part in times.split(_TIMES_AT_ONCE, dim=1)], dim=1)
 
     def _drawn_frames(self) -> Float[Tensor, "i t"]:
-        """Returns T training frames of every instance, spread evenly over its frames, different ones in every step."""
+        """Return T training frames of every instance, spread evenly over its frames, different ones in every step."""
         self.draws += 1
         spread = torch.arange(self.settings.frames, device=self.times.device) / max(self.settings.frames, 1)
         places = (spread + self.draws * _GOLDEN) % 1.0
@@ -191,7 +191,7 @@ class TemporalMask(Mask):
         return (rows.means.detach() - self.centers[instances]) / self.half_sizes[instances]
 
     def _encoded(self, values: Float[Tensor, "*b c"]) -> Float[Tensor, "*b e"]:
-        """Returns the values, and sine and cosine of pi, 2 pi, 4 pi ... times them."""
+        """Return the values, and sine and cosine of pi, 2 pi, 4 pi ... times them."""
         octaves = [math.pi * 2**octave * values for octave in range(self.settings.octaves)]
         return torch.cat([values, *map(torch.sin, octaves), *map(torch.cos, octaves)], dim=-1)
 

@@ -26,7 +26,7 @@ _EXTREMES = (Coverage(1.0, 0.0), Coverage(0.0, 1.0), Coverage(0.0, 0.0))
 
 
 def usual_sources() -> dict[str, PointSource]:
-    """Returns the sources of conf/options/source.yaml: lidar, images, and guesses where neither sees anything.
+    """Return the sources of conf/options/source.yaml: lidar, images, and guesses where neither sees anything.
 
     >>> list(usual_sources())
     ['lidar', 'images', 'near', 'far']
@@ -76,11 +76,11 @@ class BackgroundSettings(NodeSettings):
             )
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Background":
-        """Raises ValueError if there is not a single point to start from."""
+        """Raise ValueError if there is not a single point to start from."""
         return Background(self, *self.start_from(self.seeds(data, generator), data, generator))
 
     def seeds(self, data: TrainingData, generator: torch.Generator) -> Seeds:
-        """Returns the points of the sources. Raises ValueError if there is not a single point."""
+        """Return the points of the sources. Raises ValueError if there is not a single point."""
         shared = any(source.number is None for source in self.sources.values())
         seen = coverage(data) if shared else Coverage(0.0, 0.0)  # of which nobody asks for a share
         drawn = {
@@ -103,7 +103,7 @@ class BackgroundSettings(NodeSettings):
         return seeds
 
     def _asked(self, source: PointSource, seen: Coverage) -> int:
-        """Returns how many points a source is asked for: its own number, or its share by what the images show."""
+        """Return how many points a source is asked for: its own number, or its share by what the images show."""
         return round(self.num_points * source.share(seen)) if source.number is None else source.number
 
     def start_from(
@@ -113,7 +113,7 @@ class BackgroundSettings(NodeSettings):
         generator: torch.Generator,
         columns: Mapping[str, Tensor] | None = None,
     ) -> tuple[Rows, Mask | None]:
-        """Calls ``start`` with the scales, meters, that seeds and their neighbors allow; what is on a surface lies in
+        """Call ``start`` with the scales, meters, that seeds and their neighbors allow; what is on a surface lies in
         it."""
         scales = neighbor_scales(seeds.points.positions).clamp(seeds.smallest, seeds.largest)
         rows, mask = self.start(data, seeds.points, scales, seeds.opacities, generator, columns=columns)
@@ -135,5 +135,5 @@ class Background(Node):
     """Static Gaussians, whose rows are in the world frame."""
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Returns the same Gaussians for every view, except for the mask."""
+        """Return the same Gaussians for every view, except for the mask."""
         return self.stored(view)

@@ -94,7 +94,7 @@ class DeformationNetwork(nn.Module):
         features: Float[Tensor, "i f"] | None = None,
         instances: Int[Tensor, " n"] | None = None,
     ) -> Deformation:
-        """Takes ``features`` of the instances and the instance of each row, or neither."""
+        """Take ``features`` of the instances and the instance of each row, or neither."""
         rows = encoded(positions, self.settings.position_octaves)
         instants = encoded(positions.new_full((1, 1), time), self.settings.time_octaves)
         if features is not None:
@@ -110,7 +110,7 @@ class DeformationNetwork(nn.Module):
 
 
 def check_stored(settings: NetworkSettings, tensors: Mapping[str, Tensor], features: int = 0) -> None:
-    """Raises ValueError unless a node's tensors in a scene file hold the network that its settings say.
+    """Raise ValueError unless a node's tensors in a scene file hold the network that its settings say.
 
     For whoever restores a node: settings decide how much memory a network takes, and a damaged file says anything.
     """
@@ -143,7 +143,7 @@ class _Inputs(nn.Module):
 
 
 def encoded(values: Float[Tensor, "n c"], octaves: int) -> Float[Tensor, "n e"]:
-    """Returns the values, and sines and cosines of 1, 2, 4 ... times them; each octave is computed from the last.
+    """Return the values, and sines and cosines of 1, 2, 4 ... times them; each octave is computed from the last.
 
     >>> encoded(torch.zeros(1, 1), octaves=2).tolist()
     [[0.0, 0.0, 1.0, 0.0, 1.0]]
@@ -179,7 +179,7 @@ class DeformableSettings(TrackedSettings):
         return Deformable
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Deformable | None":
-        """Builds the node without boxes of frames that have no training image (held out, or outside the range)."""
+        """Build the node without boxes of frames that have no training image (held out, or outside the range)."""
         node = cast(Deformable | None, super().build(data, generator))  # it builds a node_class
         if node is not None:
             node.start_network(generator.initial_seed())
@@ -199,20 +199,20 @@ class Deformable(Tracked):
     settings: DeformableSettings
 
     def __init__(self, *args: Any, **keywords: Any) -> None:
-        """Takes the arguments of ``Tracked``; the network starts from seed 0."""
+        """Take the arguments of ``Tracked``; the network starts from seed 0."""
         super().__init__(*args, **keywords)
         for corrections in (self.rotation_deltas, self.translation_deltas):
             corrections.requires_grad_(self.settings.refine_boxes)
         self.start_network(0)
 
     def start_network(self, seed: int) -> None:
-        """Draws weights, and embeddings uniform in [0, 1), from the seed's own stream."""
+        """Draw weights, and embeddings uniform in [0, 1), from the seed's own stream."""
         features, generator = self.settings.features, torch.Generator().manual_seed(seed)
         self.embeddings = nn.Parameter(torch.rand(len(self.names), features, generator=generator).to(self.sizes))
         self.network = DeformationNetwork(self.settings.network, features, seed).to(self.sizes)
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Returns every instance's Gaussians, deformed and at its pose; opacity is exactly 0 if it is absent."""
+        """Return every instance's Gaussians, deformed and at its pose; opacity is exactly 0 if it is absent."""
         placed = self.placed(view)
         if state.progress < self.settings.deform_from:
             return placed
@@ -230,7 +230,7 @@ class Deformable(Tracked):
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Returns ``out_of_box``, which replaces a cull because arms and legs may leave a box for a moment."""
+        """Return ``out_of_box``, which replaces a cull because arms and legs may leave a box for a moment."""
         beyond = torch.relu(raw.means.abs() - self.sizes.index_select(0, self.rows.instances) / 2)
         return {"out_of_box": self.settings.outside_weight * beyond.sum() / max(beyond.numel(), 1)}
 
@@ -268,7 +268,7 @@ class FieldSettings(BackgroundSettings):
             raise ValueError(f"reach is a distance in meters and must be >= 0, got {self.reach}; null: no limit")
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Field":
-        """Raises ValueError if there is not a single point to start from."""
+        """Raise ValueError if there is not a single point to start from."""
         rows, mask = self.start_from(self.seeds(data, generator), data, generator)
         log = data.log
         return Field(
@@ -317,7 +317,7 @@ class Field(Node):
         self.network = DeformationNetwork(settings.network, seed=seed)
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Returns all rows; those in or near the view are deformed."""
+        """Return all rows; those in or near the view are deformed."""
         stored = self.stored(view)
         if state.progress < self.settings.deform_from:
             return stored
@@ -347,7 +347,7 @@ class Field(Node):
 
     @torch.no_grad()
     def _near(self, view: View) -> Int[Tensor, " k"] | None:
-        """Returns rows that the view may see once deformed; a row ends three standard deviations from its center."""
+        """Return rows that the view may see once deformed; a row ends three standard deviations from its center."""
         if self.settings.reach is None:
             return None
         sizes = 3 * self.rows.log_scales.amax(1).exp()
@@ -364,7 +364,7 @@ class Field(Node):
         return scaled * (2 - 1 / lengths) / lengths / 4 + 0.5
 
     def _time_noise(self, state: SceneState) -> float:
-        """Returns noise that depends on the step alone, so a resumed run draws the same as an uninterrupted one."""
+        """Return noise that depends on the step alone, so a resumed run draws the same as an uninterrupted one."""
         settings = self.settings
         left = max(1 - state.progress / settings.time_noise_until, 0.0) if settings.time_noise_until > 0 else 0.0
         normal = torch.randn((), generator=named_generator(self.seed, f"time noise {state.progress}")).item()

@@ -28,7 +28,7 @@ REACH = 5
 
 
 def sharp_shape(log_scales: Float[Tensor, "n 3"], max_axis_ratio: float) -> Float[Tensor, ""]:
-    """Returns the mean of relu(log s_max - log s_min - log r), above 0 if axes differ by more than a factor r.
+    """Return the mean of relu(log s_max - log s_min - log r), above 0 if axes differ by more than a factor r.
 
     DriveStudio's term, ``sharp_shape_ratio``, is linear in the ratio. The ratio overflows for a needle, and its
     gradient grows with it; the logarithm does neither.
@@ -41,7 +41,7 @@ def sharp_shape(log_scales: Float[Tensor, "n 3"], max_axis_ratio: float) -> Floa
 
 
 def sharp_shape_ratio(log_scales: Float[Tensor, "n 3"], max_axis_ratio: float) -> Float[Tensor, ""]:
-    """Returns the mean of max(s_max / s_min, r) - r, DriveStudio's term against needles.
+    """Return the mean of max(s_max / s_min, r) - r, DriveStudio's term against needles.
 
     >>> sharp_shape_ratio(torch.tensor([[12.0, 1.0, 1.0], [2.0, 1.0, 1.0]]).log(), max_axis_ratio=10.0).item()
     1.0
@@ -51,7 +51,7 @@ def sharp_shape_ratio(log_scales: Float[Tensor, "n 3"], max_axis_ratio: float) -
 
 
 def excess_volume(log_scales: Float[Tensor, "n 3"], quantile: float) -> Float[Tensor, ""]:
-    """Returns the mean of relu(v - p) of the products v of the scales, cubic meters, and p their quantile.
+    """Return the mean of relu(v - p) of the products v of the scales, cubic meters, and p their quantile.
 
     p is the floor(quantile n)-th smallest of them, and is differentiated too, as in DriveStudio.
 
@@ -72,7 +72,7 @@ def temporal_smoothness_at(
     time: float,
     distance: int,
 ) -> Float[Tensor, ""]:
-    """Returns the part of ``temporal_smoothness`` of the keyframes at one time and their neighbors at one distance.
+    """Return the part of ``temporal_smoothness`` of the keyframes at one time and their neighbors at one distance.
 
     The mean is over the objects that have all three keyframes. DriveStudio's term of a step: the time is that of its
     view, the distance is drawn. A keyframe is that of a time up to half of the shortest step between keyframes away,
@@ -105,7 +105,7 @@ def temporal_smoothness_at(
 def temporal_smoothness(
     times: Float[Tensor, "i k"], translations: Float[Tensor, "i k 3"], valid: Bool[Tensor, "i k"]
 ) -> Float[Tensor, ""]:
-    """Returns how far keyframes lie off the straight line between two others, meters, as the mean of |t+ + t- - 2 t|.
+    """Return how far keyframes lie off the straight line between two others, meters, as the mean of |t+ + t- - 2 t|.
 
     The mean is over all objects, coordinates, keyframes and neighbors 1 to ``REACH`` keyframes before and after.
     Gradients go only to the middle keyframe. If the three are not evenly spaced (frames are held out), the line is
@@ -220,11 +220,11 @@ class NodeSettings(ABC):
 
     @abstractmethod
     def build(self, data: TrainingData, generator: torch.Generator) -> "Node | None":
-        """Makes the node from training data; returns None if it would have no instance."""
+        """Make the node from training data; return None if it would have no instance."""
 
     @abstractmethod
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Node":
-        """Returns the node of a scene file from its table, all its tensors by name, and its ``Node.header``."""
+        """Return the node of a scene file from its table, all its tensors by name, and its ``Node.header``."""
 
     def start(
         self,
@@ -238,7 +238,7 @@ class NodeSettings(ABC):
         buffers: Mapping[str, Tensor] | None = None,
         scope: MaskScope | None = None,
     ) -> tuple[Rows, Mask | None]:
-        """Returns the table of a new node, one Gaussian a point, and its mask.
+        """Return the table of a new node, one Gaussian a point, and its mask.
 
         ``scales`` are meters, ``opacities`` lie in (0, 1). ``columns`` are learned in addition to those of every node;
         ``buffers`` are further data of each row. ``scope`` says where and when the mask's instances are (None:
@@ -277,7 +277,7 @@ class Instances:
     """Class names of their tracks, "" where they are not known; None: unknown."""
 
     def counts(self) -> Int[Tensor, " i"]:
-        """Returns the number of rows of every instance."""
+        """Return the number of rows of every instance."""
         return torch.bincount(self.ids, minlength=len(self.names))
 
 
@@ -308,7 +308,7 @@ class Node(nn.Module, ABC):
 
     @abstractmethod
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Returns the node's Gaussians in a view before activation, and how they are masked and placed.
+        """Return the node's Gaussians in a view before activation, and how they are masked and placed.
 
         A view without frame and camera index is novel, and only its time counts.
         """
@@ -321,13 +321,13 @@ class Node(nn.Module, ABC):
         return None
 
     def gaussians_at(self, view: View, state: SceneState) -> Gaussians:
-        """Returns the node's Gaussians in the world, activated, with the mask applied."""
+        """Return the node's Gaussians in the world, activated, with the mask applied."""
         return activate([self.raw_at(view, state)], sh_degree=state.sh_degree)
 
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Returns terms of the loss that concern only the node, by name, each with its weight.
+        """Return terms of the loss that concern only the node, by name, each with its weight.
 
         ``raw`` is what the node returned for the view of this step, so nothing is computed twice. ``drawn`` are the
         rows that the view shows. A term that pulls at all rows in every step beats the image at rows that few views
@@ -338,7 +338,7 @@ class Node(nn.Module, ABC):
     def regularizers(
         self, view: View, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Returns the node's own terms, those of its density strategy, and those that have a weight in the settings."""
+        """Return the node's own terms, those of its density strategy, and those that have a weight in the settings."""
         settings = self.settings
         shape = {}
         if settings.sharp_shape > 0 and state.step % settings.sharp_shape_every == 0:
@@ -350,23 +350,23 @@ class Node(nn.Module, ABC):
         return shape | self.own_regularizers(raw, drawn, state)
 
     def outside(self) -> Bool[Tensor, " n"] | None:
-        """Returns whether each row left the bounds of its instance; None for a node without bounds."""
+        """Return whether each row left the bounds of its instance; None for a node without bounds."""
         return None
 
     def instances(self) -> Instances | None:
-        """Returns the node's objects; None for a node without objects."""
+        """Return the node's objects; None for a node without objects."""
         return None
 
     def header(self) -> dict[str, Any]:
-        """Returns what a scene file needs in addition to settings and tensors; JSON values only."""
+        """Return what a scene file needs in addition to settings and tensors; JSON values only."""
         return {}
 
     def pose_bytes(self) -> int:
-        """Returns the float32 bytes of what moves the rows over time; 0 for a static node."""
+        """Return the float32 bytes of what moves the rows over time; 0 for a static node."""
         return 0
 
     def stored(self, view: View) -> RawGaussians:
-        """Returns the learned rows, with the mask at the time of a view."""
+        """Return the learned rows, with the mask at the time of a view."""
         rows = self.rows
         return RawGaussians(
             rows.means,
@@ -395,7 +395,7 @@ class Node(nn.Module, ABC):
             self.rows.register_buffer(name, values)
 
     def row_bytes(self) -> int:
-        """Returns the float32 bytes of the rows without their masks; an instance id is one number, bits are packed."""
+        """Return the float32 bytes of the rows without their masks; an instance id is one number, bits are packed."""
         columns = self.rows.columns()
         return sum(_bytes(columns[name]) for name in columns.keys() - self.rows.transient)
 
@@ -414,7 +414,7 @@ def _bytes(column: Tensor) -> int:
 
 
 def stored_frame_periods(header: Mapping[str, Any]) -> float:
-    """Returns ``DrivingLog.frame_periods`` from a node's header in a scene file; older files have the number of frames.
+    """Return ``DrivingLog.frame_periods`` from a node's header in a scene file; older files have the number of frames.
 
     >>> stored_frame_periods({"frame_periods": 3.5}), stored_frame_periods({"num_frames": 4})
     (3.5, 3.0)

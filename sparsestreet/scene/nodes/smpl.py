@@ -79,7 +79,7 @@ class SmplSettings(TrackedSettings):
         return Smpl
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Smpl | None":
-        """Builds the node without people who have no pose in a training frame; a warning counts them."""
+        """Build the node without people who have no pose in a training frame; a warning counts them."""
         tracks = [track for track in data.tracks if bool(trained_poses(track, data.held_out).any())]
         if len(tracks) < len(data.tracks):
             _log.warning("%d people have no pose in a training frame and are left out", len(data.tracks) - len(tracks))
@@ -115,7 +115,7 @@ class SmplSettings(TrackedSettings):
         people: People,
         generator: torch.Generator,
     ) -> tuple[Rows, Mask | None]:
-        """Starts with discs along the surface, each as large as its vertex's part of it, and half as thick."""
+        """Start with discs along the surface, each as large as its vertex's part of it, and half as thick."""
         count, per_person = people.vertices.shape[:2]
         surfaces = [surface(vertices, template.faces) for vertices in people.vertices]
         areas, normals = (torch.cat(parts) for parts in zip(*surfaces, strict=True))
@@ -144,7 +144,7 @@ class SmplSettings(TrackedSettings):
 
 
 def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "i v 3"]) -> Float[Tensor, "n 3"]:
-    """Returns for each vertex the mean color of the nearest measured points of its box; gray without any.
+    """Return for each vertex the mean color of the nearest measured points of its box; gray without any.
 
     Measured points are returns and points from images, pooled over all frames; limbs swing about their mean places.
     """
@@ -169,7 +169,7 @@ def _measured(found: TriangulatedPoints) -> Points:
 
 
 def _from_third_axis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Returns the shortest rotation that takes the z axis to each unit direction."""
+    """Return the shortest rotation that takes the z axis to each unit direction."""
     x, y, z = directions.unbind(1)
     # Half of the turn lies between the axis and the direction; straight down, any axis works.
     turn = torch.stack((1 + z, -y, x, torch.zeros_like(z)), 1)
@@ -204,7 +204,7 @@ class Smpl(Tracked):
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
-        """Takes the arguments of ``Tracked``; rows also have the buffer ``vertex_ids`` [n] int64, template vertices."""
+        """Take the arguments of ``Tracked``; rows also have the buffer ``vertex_ids`` [n] int64, template vertices."""
         super().__init__(settings, rows, keyframes, sizes, names=names, classes=classes, max_gap=max_gap, mask=mask)
         self.register_buffer("vertices", anatomy.vertices)
         self.register_buffer("attached", anatomy.attached)
@@ -216,7 +216,7 @@ class Smpl(Tracked):
         self._neighbors: tuple[Tensor, Tensor] | None = None
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Returns every person's Gaussians, moved by the skeleton; opacity is exactly 0 if the person is absent."""
+        """Return every person's Gaussians, moved by the skeleton; opacity is exactly 0 if the person is absent."""
         raw = self.placed(view)
         bones = posed_bones(self.joints, self.joint_rotations(view.time))
         all_bones = Bones(bones.transforms.flatten(0, 1), bones.quaternions.flatten(0, 1))
@@ -226,7 +226,7 @@ class Smpl(Tracked):
         return replace(raw, means=means, quaternions=quaternions)
 
     def object_frames(self, poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
-        """Returns upright frames at the pelvis; x is where its z points, seen from above."""
+        """Return upright frames at the pelvis; x is where its z points, seen from above."""
         frames = matrices(poses)
         ahead = frames[:, :2, 2]
         yaws = np.arctan2(ahead[:, 1], ahead[:, 0])
@@ -237,13 +237,13 @@ class Smpl(Tracked):
         return frames
 
     def frame_height(self, instance: int) -> float:
-        """Returns how far the pelvis of a person at rest is above the soles."""
+        """Return how far the pelvis of a person at rest is above the soles."""
         own = self.rows.means.detach()[self.rows.instances == instance, 1]
         # A few Gaussians may have left the body.
         return float(-own.quantile(0.005)) if len(own) else 0.0
 
     def joint_rotations(self, time: float) -> Float[Tensor, "i 24 4"]:
-        """Returns the joints of every person relative to their parents at a time; the pelvis is at rest."""
+        """Return the joints of every person relative to their parents at a time; the pelvis is at rest."""
         table = self.keyframes
         at = keyframe_interval(table.times, table.valid, table.spans, time, self.max_gap)
         each = torch.arange(len(at.lower), device=at.lower.device)
@@ -259,7 +259,7 @@ class Smpl(Tracked):
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Returns those of ``neighbors``, ``scale``, ``volume`` and ``smoothness`` that have a weight."""
+        """Return those of ``neighbors``, ``scale``, ``volume`` and ``smoothness`` that have a weight."""
         terms, settings = {}, self.settings
         if len(self.rows) and settings.neighbor_weight > 0:
             terms["neighbors"] = settings.neighbor_weight * self._spread(raw, drawn)
@@ -272,13 +272,13 @@ class Smpl(Tracked):
         return terms
 
     def pose_bytes(self) -> int:
-        """Returns the bytes of ``Tracked`` with 23 quaternions a keyframe, and the body's vertices, joints, weights."""
+        """Return the bytes of ``Tracked`` with 23 quaternions a keyframe, and the body's vertices, joints, weights."""
         per_keyframe = 4 * (NUM_JOINTS - 1) * int(self.keyframe_valid.sum())
         body = sum(part.numel() for part in (self.vertices, self.attached, self.weights, self.joints))
         return super().pose_bytes() + BYTES_PER_NUMBER * (per_keyframe + body)
 
     def _spread(self, raw: RawGaussians, drawn: Bool[Tensor, " n"]) -> Float[Tensor, ""]:
-        """Returns the mean standard deviation among neighbors of drawn rows, summed over attributes."""
+        """Return the mean standard deviation among neighbors of drawn rows, summed over attributes."""
         attributes = (
             quat.normalized(self.rows.quaternions),
             raw.log_scales.exp(),
@@ -294,7 +294,7 @@ class Smpl(Tracked):
         return torch.stack([_mean_of(part.mean(1), drawn) for part in spread.split(widths, 1)]).sum()
 
     def _unevenness(self) -> Float[Tensor, ""]:
-        """Returns the mean squared distance of joints from the interpolation of their neighbors in time."""
+        """Return the mean squared distance of joints from the interpolation of their neighbors in time."""
         turned = quat.multiply(self.joint_keyframes, quat.from_rotation_vector(self.joint_deltas))
         before, here, after = (self.keyframe_times[:, start : start - 2 or None] for start in range(3))
         # Held-out frames leave gaps, so the times decide where the middle is.
@@ -305,7 +305,7 @@ class Smpl(Tracked):
         return (distance.square().sum((2, 3)) * counts).sum() / ((NUM_JOINTS - 1) * counts.sum()).clamp(min=1)
 
     def _nearest(self) -> Int[Tensor, "n k"]:
-        """Returns the nearest rows on the body at rest, itself included; searches again when the rows have changed."""
+        """Return the nearest rows on the body at rest, itself included; searches again when the rows have changed."""
         vertices = self.rows.vertex_ids
         # Every plan replaces this tensor, even if the number of rows stays the same.
         if self._neighbors is None or self._neighbors[0] is not vertices:

@@ -67,7 +67,7 @@ class TrackedSettings(NodeSettings):
         """The node class of these settings."""
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Tracked | None":
-        """Builds the node without boxes of frames that have no training image (held out, or outside the range).
+        """Build the node without boxes of frames that have no training image (held out, or outside the range).
 
         Instances without any point are left out; None if there is no instance.
         """
@@ -112,7 +112,7 @@ class TrackedSettings(NodeSettings):
         return self.node_class(self, rows, trajectories, tensors["sizes"], **stored_objects(header))
 
     def _object_points(self, track: Track, measured: Points, generator: torch.Generator) -> Points:
-        """Returns one object's colored points in its box frame, filled up if there are too few."""
+        """Return one object's colored points in its box frame, filled up if there are too few."""
         points = measured.sampled(self.points_per_instance, generator)
         missing = min(self.box_points, self.points_per_instance) - len(points)
         if missing <= 0:
@@ -123,7 +123,7 @@ class TrackedSettings(NodeSettings):
 
 
 def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
-    """Returns the annotated poses of a scene file."""
+    """Return the annotated poses of a scene file."""
     return Trajectories(
         tensors["keyframe_times"],
         tensors["keyframe_quaternions"],
@@ -134,13 +134,13 @@ def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
 
 
 def stored_objects(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns what a scene file says of a node's objects, as ``Tracked`` takes it; older files have no classes."""
+    """Return what a scene file says of a node's objects, as ``Tracked`` takes it; older files have no classes."""
     classes = tuple(header["classes"]) if "classes" in header else None
     return {"names": tuple(header["names"]), "classes": classes, "max_gap": header["max_gap"]}
 
 
 def matrices(poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
-    """Returns poses as world_from_box, on the host."""
+    """Return poses as world_from_box, on the host."""
     frames = np.tile(np.eye(4), (len(poses.quaternions), 1, 1))
     frames[:, :3, :3] = quat.to_matrix(poses.quaternions.detach().double()).cpu().numpy()
     frames[:, :3, 3] = poses.translations.detach().cpu().numpy()
@@ -150,14 +150,14 @@ def matrices(poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
 def moved_by_boxes(
     means: Float[Tensor, "n 3"], instances: Int[Tensor, " n"], before: Poses, after: Poses
 ) -> Float[Tensor, "n 3"]:
-    """Returns how far means in boxes, meters, move in the world as their boxes do."""
+    """Return how far means in boxes, meters, move in the world as their boxes do."""
     turn = quat.to_matrix(after.quaternions) - quat.to_matrix(before.quaternions)
     shift = after.translations - before.translations
     return (turn[instances] @ means[:, :, None]).squeeze(-1) + shift[instances]
 
 
 def _from_images(track: Track, data: TrainingData) -> Points:
-    """Returns the points from images inside the track's box, in its frame."""
+    """Return the points from images inside the track's box, in its frame."""
     if data.image_points is None:
         return Points.concatenate([])
     found = data.image_points.in_boxes[track.name]
@@ -190,7 +190,7 @@ class Tracked(Node):
         max_gap: float = 0.05,
         mask: Mask | None = None,
     ) -> None:
-        """Makes a node from its tables.
+        """Make a node from its tables.
 
         Args:
             settings: the settings of the node.
@@ -238,30 +238,30 @@ class Tracked(Node):
             self.register_buffer(name, values)
 
     def smooth_boxes(self) -> None:
-        """Starts the boxes' corrections where they make each object's path smooth (``geometry.smooth_paths``)."""
+        """Start the boxes' corrections where they make each object's path smooth (``geometry.smooth_paths``)."""
         with torch.no_grad():
             rotations, translations = smoothed(self.keyframes)
             self.rotation_deltas.copy_(rotations)
             self.translation_deltas.copy_(translations)
 
     def placed(self, view: View) -> RawGaussians:
-        """Returns the stored rows, each placed by its instance's box at the view's time; opacity 0 if it is absent."""
+        """Return the stored rows, each placed by its instance's box at the view's time; opacity 0 if it is absent."""
         return replace(self.stored(view), placement=Placement(self.pose_at(view.time), self.rows.instances))
 
     def pose_at(self, time: float) -> Poses:
-        """Returns pose and presence of every instance at a normalized time."""
+        """Return pose and presence of every instance at a normalized time."""
         return poses_at(self.keyframes, self.rotation_deltas, self.translation_deltas, time, self.max_gap)
 
     def object_frames(self, poses: Poses) -> Float64[np.ndarray, "i 4 4"]:
-        """Returns the frames of all objects at such poses: world_from_object, x ahead, y left, z up."""
+        """Return the frames of all objects at such poses: world_from_object, x ahead, y left, z up."""
         return matrices(poses)
 
     def frame_height(self, instance: int) -> float:
-        """Returns how far the origin of an object's frame is above the ground that it stands on, meters."""
+        """Return how far the origin of an object's frame is above the ground that it stands on, meters."""
         return float(self.sizes[instance, 2]) / 2
 
     def displacements_over(self, span: float, view: View, raw: RawGaussians) -> Float[Tensor, "n 3"]:
-        """Returns the motion of the rows' boxes; a body that walks meanwhile, or a network's change, is left out."""
+        """Return the motion of the rows' boxes; a body that walks meanwhile, or a network's change, is left out."""
         before, after = (self.pose_at(view.time + side * span / 2) for side in (-1, 1))
         return moved_by_boxes(raw.means, self.rows.instances, before, after)
 
@@ -284,7 +284,7 @@ class Tracked(Node):
 
     @property
     def keyframes(self) -> Trajectories:
-        """Returns the annotated poses of the training frames, without corrections."""
+        """Return the annotated poses of the training frames, without corrections."""
         return Trajectories(
             self.keyframe_times,
             self.keyframe_quaternions,
@@ -294,14 +294,14 @@ class Tracked(Node):
         )
 
     def instances(self) -> Instances:
-        """Returns the objects, named like their tracks."""
+        """Return the objects, named like their tracks."""
         return Instances(self.names, self.rows.instances, self.sizes, self.spans, self.classes)
 
     def header(self) -> dict[str, Any]:
         return {"names": list(self.names), "classes": list(self.classes), "max_gap": self.max_gap}
 
     def pose_bytes(self) -> int:
-        """Returns the float32 bytes of the keyframes: each a time, a quaternion and a translation with corrections."""
+        """Return the float32 bytes of the keyframes: each a time, a quaternion and a translation with corrections."""
         return BYTES_PER_NUMBER * 8 * int(self.keyframe_valid.sum())
 
 
@@ -327,9 +327,9 @@ class Rigid(Tracked):
     settings: RigidSettings
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Returns every instance's Gaussians at its pose; opacity is exactly 0 if the instance is absent."""
+        """Return every instance's Gaussians at its pose; opacity is exactly 0 if the instance is absent."""
         return self.placed(view)
 
     def outside(self) -> Bool[Tensor, " n"]:
-        """Returns whether each row's center left its box by more than ``box_margin``."""
+        """Return whether each row's center left its box by more than ``box_margin``."""
         return outside_boxes(self.rows.means, self.rows.instances, self.sizes, margin=self.settings.box_margin)

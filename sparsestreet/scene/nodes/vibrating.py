@@ -57,7 +57,7 @@ class VibratingSettings(BackgroundSettings):
             raise ValueError(f"smoothing_probability must lie in [0, 1], got {self.smoothing_probability}")
 
     def build(self, data: TrainingData, generator: torch.Generator) -> "Vibrating":
-        """Raises ValueError if there is not a single point to start from."""
+        """Raise ValueError if there is not a single point to start from."""
         seed = generator.initial_seed()
         periods = data.log.frame_periods if data.log.num_frames > 1 else 0.0
         seeds = self.seeds(data, generator)
@@ -92,7 +92,7 @@ class Vibrating(Node):
         self.seed = seed
 
     def raw_at(self, view: View, state: SceneState) -> RawGaussians:
-        """Returns every row at its place and with its opacity at the view's time; faded rows are hidden."""
+        """Return every row at its place and with its opacity at the view's time; faded rows are hidden."""
         rows, settings, stored = self.rows, self.settings, self.stored(view)
         shift = self._shift(state) if state.training else 0.0
         ages = view.time * settings.frame_time * self.frame_periods + shift - rows.life_peaks
@@ -109,13 +109,13 @@ class Vibrating(Node):
         )
 
     def mean_velocities(self) -> Float[Tensor, "n 3"]:
-        """Returns the average velocity of each row, meters per unit of the node's time."""
+        """Return the average velocity of each row, meters per unit of the node's time."""
         return mean_velocities(self.rows.velocities, self.rows.log_life_spans, self.settings.cycle)
 
     def own_regularizers(
         self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
     ) -> dict[str, Float[Tensor, ""]]:
-        """Returns ``velocity``, which keeps rows still that need not move."""
+        """Return ``velocity``, which keeps rows still that need not move."""
         lengths = self.mean_velocities().norm(dim=1) * drawn
         return {"velocity": self.settings.velocity_weight * lengths.sum() / drawn.sum().clamp(min=1)}
 
@@ -123,7 +123,7 @@ class Vibrating(Node):
         return {"frame_periods": self.frame_periods, "seed": self.seed}
 
     def _shift(self, state: SceneState) -> float:
-        """Returns the difference from the view's time to the time that rows are taken from.
+        """Return the difference from the view's time to the time that rows are taken from.
 
         It depends on the step alone, so a resumed run draws the same as an uninterrupted one.
         """

@@ -229,7 +229,7 @@ def step_of(checkpoint: Path) -> int:
 
 
 def _check_sums(checkpoint: Path) -> None:
-    """Raises ValueError, or what an archive that is broken fails with."""
+    """Raise ValueError, or what an archive that is broken fails with."""
     with zipfile.ZipFile(checkpoint) as archive:
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
             raise ValueError("it is compressed, as no checkpoint is")

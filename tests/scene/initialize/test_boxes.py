@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import torch
 
 from sparsestreet.geometry.cameras import inverse, transform_points
-from sparsestreet.scene.initialize.gaussians import box_surface_points, outside_swept_boxes
+from sparsestreet.scene.initialize.gaussians import box_surface_points, lidar_in_boxes, outside_swept_boxes
 from tests.scene.street import car_pose, street_log
 
 
@@ -29,3 +31,15 @@ def test_swept_boxes_are_those_of_every_frame_but_the_held_out_ones():
         assert inside.sum() > 100
         assert torch.equal(outside_swept_boxes([driving], points, held_out), ~inside)
     assert outside_swept_boxes([], points).all()
+
+
+def test_an_object_starts_from_colored_returns_alone():
+    """Of its three returns a camera sees the first two."""
+    log = street_log()
+    car, sweep = log.tracks[0], next(sweep for sweep in log.sweeps if sweep.index == int(log.tracks[0].frames[0]))
+    inside = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.2, 0.1], [0.0, 0.0, 0.3]])
+    world = transform_points(car.world_from_object[0], inside.double()).float()
+    seen = replace(sweep, points=world, colors=torch.rand(3, 3), colored=torch.tensor([True, True, False]))
+    (found,) = lidar_in_boxes([car], [seen])
+    torch.testing.assert_close(found.positions, inside[:2], atol=1e-5, rtol=0)
+    assert torch.equal(found.colors, seen.colors[:2])

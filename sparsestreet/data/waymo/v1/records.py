@@ -21,7 +21,7 @@ class Records:
     """The records of a file, found by their lengths. The file is mapped, so that only what is looked at is read."""
 
     def __init__(self, path: Path) -> None:
-        """Raises LogError for a file that is no sequence of whole records."""
+        """Raise LogError for a file that is no sequence of whole records."""
         self.path = path
         try:
             check_regular(path)

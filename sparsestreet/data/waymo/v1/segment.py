@@ -29,7 +29,7 @@ class RecordSegment(Segment):
     """Lengths tell where the parts of a frame lie; the parts are decoded when they are asked for."""
 
     def __init__(self, path: Path) -> None:
-        """Raises LogError for a file whose frames cannot be told apart."""
+        """Raise LogError for a file whose frames cannot be told apart."""
         self.source = self.calibration_file = self.image_file = path
         self.box_file = self.lidar_file = self.label_file = path
         self._records = Records(path)
