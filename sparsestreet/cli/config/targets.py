@@ -75,7 +75,7 @@ def named_by_conf() -> ClosedList:
 
 
 def leaves(tree: object, place: Place = ()) -> Iterator[tuple[Place, object]]:
-    """Yield every plain value with its place, in mappings and list however deep."""
+    """Yield every plain value with its place, in mappings and lists however deep."""
     items = tree.items() if isinstance(tree, Mapping) else enumerate(tree) if isinstance(tree, list | tuple) else None
     if items is None or (not tree and place):
         yield place, tree
