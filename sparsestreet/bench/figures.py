@@ -35,7 +35,7 @@ _STYLES = {
     "preset": ("#000000", "*"),
     "backend": ("#7F3C8D", "X"),
 }
-LEAST_ERROR = 1e-8
+MIN_ERROR = 1e-8
 """Least error that is drawn, so that an image equal to the truth is at the bottom, not at minus infinity."""
 
 
@@ -81,13 +81,13 @@ def whole_time(record: Record) -> float:
 def image_rmse(record: Record) -> float:
     """Root mean square difference of the image to its exact model (PSNR is -20 log10 of it)."""
     psnr = record["exact"]["image"]["psnr"]
-    return LEAST_ERROR if psnr is None else max(LEAST_ERROR, 10 ** (-psnr / 20))
+    return MIN_ERROR if psnr is None else max(MIN_ERROR, 10 ** (-psnr / 20))
 
 
 def gradient_l2(record: Record) -> float:
     """Relative L2 of the worst parameter group; infinite if a group's truth is zero and its gradient is not."""
     values = [group["relative_l2"] for group in record["exact"]["gradients"].values()]
-    return math.inf if None in values else max(LEAST_ERROR, *values)
+    return math.inf if None in values else max(MIN_ERROR, *values)
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:

@@ -14,11 +14,11 @@ from sparsestreet.data.photo_consistency import ReturnPairs, return_pairs
 from sparsestreet.geometry.cameras import project
 from sparsestreet.types import Frame, Track
 
-MOST_FRAMES = 40
+MAX_FRAMES = 40
 """Of a camera; a hundred megabytes at 960x640."""
-LEAST_DRIVE = 20.0
+MIN_DRIVE = 20.0
 """Meters the camera has to move, so that the street has changed in every image."""
-LEAST_WIDTH = 0.25
+MIN_WIDTH = 0.25
 """Share of the image's columns in which a hood is seen. Smooth road over a straight line looks like one in up to 8 % of
 the columns of synthetic streets."""
 _STILL = 4.0
@@ -29,7 +29,7 @@ _SAME = 0.7
 """Share of the edges of single images that the median image keeps; a moving edge is blurred."""
 _PAIRS = 20
 """Images of a camera that are compared with the next one."""
-_FEWEST_RETURNS = 100
+_MIN_RETURNS = 100
 _JUMP = 2
 """Rows from one column to the next by which a hood's edge does not move: the line is a median over many columns."""
 _HOOD_CHANGES = 0.65
@@ -65,8 +65,8 @@ def find_hoods(frames: Frames, sweeps: Sweeps) -> dict[int, Hood]:
     found = {}
     for camera in sorted({view.indices[1] for view in frames.views}):
         own = frames.where(lambda view, camera=camera: view.indices[1] == camera)
-        if driven(own) >= LEAST_DRIVE:
-            gray = torch.stack([own[place].image.float().mean(-1) for place in spread(len(own), MOST_FRAMES)])
+        if driven(own) >= MIN_DRIVE:
+            gray = torch.stack([own[place].image.float().mean(-1) for place in spread(len(own), MAX_FRAMES)])
             mask = _seen_still(gray)
             mask = _without_street(mask, own, sweeps)
             if not mask.any():
@@ -94,11 +94,11 @@ def _without_street(mask: Bool[Tensor, "h w"], frames: Frames, sweeps: Sweeps) -
     piece = torch.cat((heights.new_zeros(1), (heights[1:] - heights[:-1]).abs() > _JUMP)).cumsum(0)
     moved, stayed, columns = _followed(mask, frames, sweeps)
     returns = piece[columns].bincount(minlength=len(heights))[piece]
-    piece = torch.where(returns < _FEWEST_RETURNS, -1, piece)
+    piece = torch.where(returns < _MIN_RETURNS, -1, piece)
     street = torch.zeros_like(piece, dtype=torch.bool)
     for one in piece.unique():
         own = piece[columns] == one
-        if int(own.sum()) >= _FEWEST_RETURNS:
+        if int(own.sum()) >= _MIN_RETURNS:
             street[piece == one] = float(stayed[own].mean()) > _HOOD_CHANGES * float(moved[own].mean())
     if not street.any():
         return mask
@@ -176,7 +176,7 @@ def _below_a_still_edge(gray: Float[Tensor, "f h w"]) -> Bool[Tensor, "h w"]:
 def _below_line(tops: Int[Tensor, " w"], ends: Bool[Tensor, " w"], height: int) -> Bool[Tensor, "h w"]:
     """Pixels below a smooth line through the tops of the columns that have one; none where these are too few."""
     columns = torch.arange(len(tops))
-    if float(ends.float().mean()) < LEAST_WIDTH:
+    if float(ends.float().mean()) < MIN_WIDTH:
         return torch.zeros(height, len(tops), dtype=torch.bool)
     # A column whose reflection or road hides the edge is like its neighbors; the row of the edge itself is half street.
     found = columns[ends].numpy()
@@ -236,9 +236,9 @@ def find_dirt(frames: Frames, sweeps: Sweeps, tracks: Sequence[Track]) -> dict[i
     found = {}
     for camera in sorted({view.indices[1] for view in frames.views}):
         own = frames.where(lambda view, camera=camera: view.indices[1] == camera)
-        if driven(own) < LEAST_DRIVE:
+        if driven(own) < MIN_DRIVE:
             continue
-        seen = [own[place] for place in spread(len(own), MOST_FRAMES)]
+        seen = [own[place] for place in spread(len(own), MAX_FRAMES)]
         gray = torch.stack([frame.image.float().mean(-1) for frame in seen])
         told = torch.ones(gray.shape[1:], dtype=torch.bool)
         for frame in seen:

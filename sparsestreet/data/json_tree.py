@@ -13,9 +13,9 @@ from torch import Tensor
 
 from sparsestreet.data.problems import LogError, fault
 
-_LARGEST_FILE = 128_000_000
+_MAX_FILE = 128_000_000
 """Bytes; Python's values of such a file take ten times as many."""
-_LARGEST_NUMBER = 1e15
+_MAX_NUMBER = 1e15
 _LATEST = 2**63
 
 
@@ -80,7 +80,7 @@ class JsonValue:
         """Finite, and of a size that lengths, pixels and angles may have."""
         if isinstance(self.value, bool) or not isinstance(self.value, (int, float)):
             raise self.fault(f"is {_shown(self.value)}, not a number", "write a number without quotes")
-        if not abs(self.value) <= _LARGEST_NUMBER or (positive and self.value <= 0):
+        if not abs(self.value) <= _MAX_NUMBER or (positive and self.value <= 0):
             message = f"must be {'positive' if positive else 'finite'}, it is {_shown(self.value)}"
             raise self.fault(message, "write the value of the calibration or of the pose")
         return float(self.value)
@@ -139,8 +139,8 @@ def read_json(path: Path) -> JsonValue:
     remedy = "write the file again"
     if not path.is_file():
         raise fault(path, "the file is missing", "write it, or name the folder that holds it")
-    if path.stat().st_size > _LARGEST_FILE:
-        message = f"the file has {path.stat().st_size:,} bytes, more than the {_LARGEST_FILE:,} that are read"
+    if path.stat().st_size > _MAX_FILE:
+        message = f"the file has {path.stat().st_size:,} bytes, more than the {_MAX_FILE:,} that are read"
         raise fault(path, message, "write numbers with fewer digits, or split the recording")
     try:
         return JsonValue(path, "", json.loads(path.read_bytes(), object_pairs_hook=unique))
@@ -163,6 +163,6 @@ def _shown(value: Any) -> str:
     """The start of a value; what holds much is not spelled out."""
     if isinstance(value, (dict, list)):
         return f"{'an object' if isinstance(value, dict) else 'a list'} of {len(value)}"
-    if isinstance(value, int) and abs(value) > _LARGEST_NUMBER:
+    if isinstance(value, int) and abs(value) > _MAX_NUMBER:
         return "a number of too many digits"
     return f"{value!r:.40}"

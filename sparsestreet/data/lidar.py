@@ -153,9 +153,9 @@ def recolored(log: DrivingLog, parts: Split) -> Sweeps:
     return Sweeps(log.sweeps.indices, load, load_gray)
 
 
-MOST_FRAMES = 36
+MAX_FRAMES = 36
 """Images that are looked at, in half a second: embedded streets of 240x144 that fit have -0.3 to 0.4 pixels right."""
-FEWEST_EDGES = 300
+MIN_EDGES = 300
 """Of one direction; fewer say nothing."""
 REACH, STEP = 4.0, 0.5
 """Pixels: shifts from -REACH to REACH are tried."""
@@ -185,7 +185,7 @@ def edge_shift(frames: Frames, sweeps: Sweeps) -> EdgeShift | None:
     places = {index: place for place, index in enumerate(sweeps.indices)}
     shifts = torch.arange(-REACH, REACH + STEP / 2, STEP)
     slopes, counts = torch.zeros(2, len(shifts)), [0, 0]
-    for place in spread(len(frames), MOST_FRAMES):
+    for place in spread(len(frames), MAX_FRAMES):
         index, _ = frames.views[place].indices
         if index not in places:
             continue
@@ -198,7 +198,7 @@ def edge_shift(frames: Frames, sweeps: Sweeps) -> EdgeShift | None:
             edges = _edges(positions[inside], depths[inside], axis, frame)
             slopes[axis] += _slopes(frame, edges, axis, shifts)
             counts[axis] += len(edges)
-    if min(counts) < FEWEST_EDGES:
+    if min(counts) < MIN_EDGES:
         return None
     return EdgeShift(_peak(slopes[0], shifts), _peak(slopes[1], shifts), sum(counts))
 

@@ -33,7 +33,7 @@ _COARSEST_EXACT = 2.0**-10
 """Meters: float32's grid 8 to 16 km from the origin. A finer one cannot be seen."""
 _OFF_GRID = 0.05
 """Of a step of the grid, at most: views store positions in float32 near their own origin, right to 1e-5 m."""
-_FEWEST_PLACES = 6
+_MIN_PLACES = 6
 """Of numbers with random digits, all six lie this near to a grid once in a million."""
 _TREMBLES = 0.1
 """Meters, acceleration times the square of the step: less is noise of poses at a high rate."""
@@ -53,7 +53,7 @@ _SWEEPS, _POINTS = 12, 20_000
 """Sweeps, and points of each, that are looked at in boxes: half a second."""
 _SHELL, _FLOOR = 0.6, 0.15
 """Meters around a box, and about its floor, where returns are the road's."""
-_FEWEST_RETURNS = 60
+_MIN_RETURNS = 60
 """Of an object in all of the sweeps and its shell too; fewer say nothing."""
 _INSIDE = 0.75
 """Share of returns inside of a box, of those inside or in the shell. Median over the objects of a class: cars 0.97 in
@@ -71,9 +71,9 @@ _SAID = 3
 """Objects that are named of those with one fault."""
 _LIKE_ITS_POINTS = 0.2
 """Correlation of the gray levels of points with those of pixels that they fall into."""
-_MOST_POINTS = 2_000
-_FEWEST_POINTS = 100
-_MOST_VIEWS = 60
+_MAX_POINTS = 2_000
+_MIN_POINTS = 100
+_MAX_VIEWS = 60
 
 
 def contradictions(log: DrivingLog, frames: Frames, names: Sequence[str]) -> Iterator[str]:
@@ -180,7 +180,7 @@ def _coarse(log: DrivingLog, cameras: Sequence[tuple[str, Frames]]) -> Iterator[
             grid = 2.0 ** (math.floor(math.log2(max(float(axis.abs().min()), 1.0))) - 23)
             trembles = bool((axis.diff().diff().abs() > grid / 2).any())
             beside = (axis / grid - (axis / grid).round()).abs().max()
-            if grid >= _COARSEST_EXACT and trembles and len(axis.unique()) >= _FEWEST_PLACES and beside < _OFF_GRID:
+            if grid >= _COARSEST_EXACT and trembles and len(axis.unique()) >= _MIN_PLACES and beside < _OFF_GRID:
                 yield (
                     f"all positions of {what} are multiples of {grid:.4g} m, the grid of float32 at "
                     f"{float(axis.abs().max()):,.0f} m, so poses tremble: write them in float64, or take an offset "
@@ -349,7 +349,7 @@ def _inside_shares(log: DrivingLog) -> list[tuple[Track, Float[Tensor, " boxes"]
         for number, rows, in_box in near:
             free = (owner[rows] == -1) | (owner[rows] == number)
             counts[number] += _counted(in_box[free], log.tracks[number].size)
-    enough = counts[:, 0].sum(1) >= _FEWEST_RETURNS
+    enough = counts[:, 0].sum(1) >= _MIN_RETURNS
     shares = counts[..., 0] / counts.sum(-1).clamp(min=1)
     return [(track, shares[at]) for at, track in enumerate(log.tracks) if enough[at]]
 
@@ -371,13 +371,13 @@ def _counted(points: Float64[Tensor, "n 3"], size: Float[Tensor, "3"]) -> Float[
 
 
 def _unseen(points: SparsePoints, frames: Frames, cameras: Sequence[tuple[str, Frames]]) -> Iterator[str]:
-    step = len(points) // _MOST_POINTS + 1
+    step = len(points) // _MAX_POINTS + 1
     positions = points.positions[::step]
-    if len(positions) < _FEWEST_POINTS:
+    if len(positions) < _MIN_POINTS:
         return
     seen = torch.zeros(len(positions), dtype=torch.bool)
     for name, own in cameras:
-        found = [_in_image(own.views[at].camera, positions) for at in spread(len(own), _MOST_VIEWS)]
+        found = [_in_image(own.views[at].camera, positions) for at in spread(len(own), _MAX_VIEWS)]
         seen |= torch.stack(found).any(0)
         blind = sum(not some.any() for some in found)
         if 2 * blind > len(found):
@@ -406,7 +406,7 @@ def _other_colors(positions: Float[Tensor, "n 3"], gray: Float[Tensor, " n"], fr
         column, row = pixels[seen].long().unbind(1)
         pairs.append(torch.stack((gray[seen], frame.image[row, column].float().mean(1) / 255)))
     both = torch.cat(pairs, 1)
-    if both.shape[1] < _FEWEST_POINTS or float(both.std(1).min()) < 0.02:
+    if both.shape[1] < _MIN_POINTS or float(both.std(1).min()) < 0.02:
         return
     alike = float(torch.corrcoef(both)[0, 1])
     if alike < _LIKE_ITS_POINTS:
@@ -433,7 +433,7 @@ def _velocities(views: Sequence[View]) -> Float64[Tensor, "s 3"]:
     return _positions(views).diff(dim=0) / _seconds(views).diff().clamp(min=1e-9)[:, None]
 
 
-MOST_FRAMES = 36
+MAX_FRAMES = 36
 """Images that are looked at."""
 _LITTLE = 0.05
 """Of all pixels: fewer that losses see are more likely a mask that is turned round."""
@@ -462,7 +462,7 @@ def log_warnings(log: DrivingLog, frames: Frames | None = None) -> tuple[str, ..
 
 def _covered(frames: Frames, names: Sequence[str]) -> Iterator[str]:
     seen, flat, blind, used = Counter[int](), Counter[int](), Counter[int](), defaultdict[int, float](float)
-    for place in spread(len(frames), MOST_FRAMES):
+    for place in spread(len(frames), MAX_FRAMES):
         frame = frames[place]
         camera = frame.indices[1]
         gray = frame.image.float().mean(-1)

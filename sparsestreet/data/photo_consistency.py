@@ -15,7 +15,7 @@ from sparsestreet.types import Frame, Sweep, Track, View
 Pixels = tuple[Int[Tensor, " n"], Int[Tensor, " n"]]
 PAIRS = 8
 """Of images of a camera that are compared."""
-LEAST_STEP = 1.5
+MIN_STEP = 1.5
 """Meters between the two images of a pair. From one image to the next the color of a hood that nobody declares, or of
 a few large pixels, outweighs the street's."""
 FEWEST = 50
@@ -86,7 +86,7 @@ def _pairs(views: Sequence[View]) -> list[tuple[int, int]]:
     positions = torch.stack([view.camera.position for view in views])
     found = []
     for place in range(len(views) - 1):
-        far = torch.nonzero((positions[place + 1 :] - positions[place]).norm(dim=1) >= LEAST_STEP)
+        far = torch.nonzero((positions[place + 1 :] - positions[place]).norm(dim=1) >= MIN_STEP)
         if len(far):
             found.append((place, place + 1 + int(far[0])))
     return found

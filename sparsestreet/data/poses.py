@@ -195,7 +195,7 @@ def untwisted(
     return moved
 
 
-LARGEST_SCENE = 20_000.0
+MAX_SCENE = 20_000.0
 """Meters. Re-centered coordinates of up to this are exact to 1 mm in float32 (spacing 2^-9 m beyond 16 km, rounded)."""
 
 
@@ -209,9 +209,9 @@ def check_extent(placed: Sequence[tuple[Path, Float64[Tensor, "3"]]]) -> list[Pr
         return []
     positions = torch.stack([position for _, position in placed])
     extent = float((positions.amax(0) - positions.amin(0)).max())
-    if extent <= LARGEST_SCENE:
+    if extent <= MAX_SCENE:
         return []
     strayed = int((positions - positions.median(0).values).norm(dim=-1).argmax())
-    message = f"poses span {extent / 1000:.1f} km, more than the {LARGEST_SCENE / 1000:g} km that float32 can hold"
+    message = f"poses span {extent / 1000:.1f} km, more than the {MAX_SCENE / 1000:g} km that float32 can hold"
     remedy = "repair this pose, the farthest from the others, or read fewer frames (data.log.first_frame, .last_frame)"
     return [Problem(placed[strayed][0], message, remedy)]

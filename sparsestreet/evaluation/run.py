@@ -42,7 +42,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, node_legend, project_centers
 from sparsestreet.types import Frame, View
 
-MOST_IMAGES = 60
+MAX_IMAGES = 60
 """Images that are rendered without each effect, spread over all."""
 
 
@@ -58,7 +58,7 @@ def measure_effect_gains(
 
     ``ranks``: as in ``evaluate_frames``.
     """
-    chosen = spread(len(frames), MOST_IMAGES)
+    chosen = spread(len(frames), MAX_IMAGES)
     whole = _means([quality[index] for index in chosen])
     gains = {}
     for name in (name for name, effect in scene.effects.items() if effect.is_on):

@@ -16,7 +16,7 @@ from sparsestreet.geometry.boxes import box_at, inside_box
 from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.types import Camera, Frame, Sweep, Track, View
 
-MOST_IMAGES = 240
+MAX_IMAGES = 240
 """Images that are looked at: in five seconds at 240x144."""
 RUN = 24
 """Neighboring instants that are looked at together, where not all are: images of neighbors show the same points."""
@@ -38,7 +38,7 @@ CONTRAST = 0.5
 """Largest difference of gray levels around a point, in parts of their mean: at an edge it matters where one looks."""
 LOW = 0.8
 """Meters below a camera from which on a point belongs to the road, whose shine changes as one drives towards it."""
-FEWEST_SHARED = 40
+MIN_SHARED = 40
 """Points that two images share; fewer do not link them."""
 FLOOR = 0.003
 """Standard error of a link that no number of points goes below: surfaces shine, and gray levels are rounded."""
@@ -87,7 +87,7 @@ class ImageGains:
 
 
 def image_gains(
-    frames: Frames, sweeps: Sweeps, boxes: Sequence[Track], most: int | None = MOST_IMAGES
+    frames: Frames, sweeps: Sweeps, boxes: Sequence[Track], most: int | None = MAX_IMAGES
 ) -> ImageGains | None:
     """Gains of images that show the same static points.
 
@@ -103,7 +103,7 @@ def image_gains(
         boxes: objects that may move or shine; what lies in them is left out.
         most: images that are looked at, in runs of ``RUN`` neighboring instants; None: all.
 
-    Returns None where no two images share ``FEWEST_SHARED`` points, as without lidar.
+    Returns None where no two images share ``MIN_SHARED`` points, as without lidar.
     """
     instants = _instants(frames.views, most)
     rank = {index: place for place, index in enumerate(instants)}
@@ -256,7 +256,7 @@ class _Levels:
                     continue
                 at = place[self._numbers[second]]
                 both = at >= 0
-                if int(both.sum()) < FEWEST_SHARED:
+                if int(both.sum()) < MIN_SHARED:
                     continue
                 ratio = self._logs[second][both] - self._logs[first][at[both]]
                 low, before = self._low[second][both], self._low[first][at[both]]
@@ -277,7 +277,7 @@ class _Pairs:
 
     def add(self, first: int, second: int, ratio: Float[Tensor, "p 3"]) -> None:
         """Log ratios at shared points; too few are no link."""
-        if len(ratio) < FEWEST_SHARED:
+        if len(ratio) < MIN_SHARED:
             return
         middle = ratio.median(0).values
         self._images.append((first, second))
@@ -330,7 +330,7 @@ EV = 0.6931471805599453
 """ln 2: a gain of one EV doubles."""
 ERROR_BLOCKS = 8
 """Parts of the drive, of which each is left out once for the standard error."""
-FEWEST_INSTANTS = 8
+MIN_INSTANTS = 8
 """What images of fewer instants have in common may be the street as well as a gain."""
 
 
@@ -367,11 +367,11 @@ class GainErrors:
 def gain_errors(gains: ImageGains) -> GainErrors | None:
     """Errors of all inner images with a neighbor on both sides that both kinds of points link.
 
-    Returns None where they are of fewer than ``FEWEST_INSTANTS``.
+    Returns None where they are of fewer than ``MIN_INSTANTS``.
     """
     (low, foretold_low), (high, foretold_high) = (_errors(gains, part) for part in gains.parts)
     places = torch.tensor(sorted(foretold_low.keys() & foretold_high.keys()), dtype=torch.int64)
-    if len({gains.views[place].frame_index for place in places.tolist()}) < FEWEST_INSTANTS:
+    if len({gains.views[place].frame_index for place in places.tolist()}) < MIN_INSTANTS:
         return None
     low, high = low[places], high[places]
     without = (low * high).mean(1)

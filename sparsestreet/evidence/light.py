@@ -13,7 +13,7 @@ from torch.nn.functional import conv2d
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.types import Frame
 
-MOST_FRAMES = 36
+MAX_FRAMES = 36
 WHITE = 250
 """Of 255: a pixel is cut off where red, green and blue have at least this; JPEG moves white by a few levels."""
 MIN_STOPS = 1.25
@@ -73,7 +73,7 @@ def light_warnings(light: Light) -> Iterator[str]:
 
 def measured_light(frames: Frames) -> Light:
     """Return the light of a spread of the images."""
-    places = spread(len(frames), MOST_FRAMES)
+    places = spread(len(frames), MAX_FRAMES)
     rows = np.array([_of(frames[place]) for place in places])
     levels, noise, clipped = rows.T
     worst = int(clipped.argmax())
@@ -118,7 +118,7 @@ class SkyShare:
 
 def sky_share(frames: Frames) -> SkyShare | None:
     """The share of sky in images spread over the drive; None where they have no masks."""
-    masks = (frames[place].sky for place in spread(len(frames), MOST_FRAMES))
+    masks = (frames[place].sky for place in spread(len(frames), MAX_FRAMES))
     shares = torch.tensor([float(mask.float().mean()) for mask in masks if mask is not None])
     if not len(shares):
         return None

@@ -14,7 +14,7 @@ from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.types import Camera, Shutter, Track, View
 
-MOST_VIEWS = 60
+MAX_VIEWS = 60
 SHEAR_QUANTILE = 0.95
 _USUAL_DISTANCE = 10.0
 """Meters at which points are taken to be where there is no lidar."""
@@ -44,7 +44,7 @@ def readout_shear(views: Sequence[View], sweeps: Sweeps, quantile: float = SHEAR
         raise ValueError("shear is that of a rolling shutter, and no view has one: ask cameras with Camera.shutter")
     places = {index: place for place, index in enumerate(sweeps.indices)}
     quantiles, points = [], 0
-    for view in (rolling[index] for index in spread(len(rolling), MOST_VIEWS)):
+    for view in (rolling[index] for index in spread(len(rolling), MAX_VIEWS)):
         index, _ = view.indices
         world = sweeps[places[index]].points if index in places else _at_distance(view.camera)
         moved = _moved(view.camera, world)

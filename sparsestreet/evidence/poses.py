@@ -14,7 +14,7 @@ from sparsestreet.triangulation.points import Observations, TriangulatedPoints, 
 from sparsestreet.types import Frame, Track, View
 
 STEPS = 10
-LEAST_NOISE = 0.05
+MIN_NOISE = 0.05
 """Pixels; the position of a feature is not known better."""
 PRIOR = np.repeat((0.3, 0.03), 3)
 """Standard deviations of corrections, meters and radians: what rays leave open stays near zero."""
@@ -47,7 +47,7 @@ def adjust(observations: Observations, image: Int[np.ndarray, " o"], images: int
     for _ in range(STEPS):
         residual, by_pose, by_point = _derivatives(replace(observations, camera_from_frame=moved), points)
         # Of wrong matches, which there are always some, nothing is left when the noise is found (Geman and McClure).
-        noise = max(1.4826 * float(np.median(np.abs(residual))), LEAST_NOISE)
+        noise = max(1.4826 * float(np.median(np.abs(residual))), MIN_NOISE)
         ratio = (residual / (3 * noise)) ** 2
         weight = ((1 + ratio.sum(1)) ** -2 / noise**2)[:, None, None]
         own = _damped(summed(_product(by_point, weight * by_point), observations.point, count))
@@ -126,7 +126,7 @@ def _moved(
 
 BLOCKS, INSTANTS = 3, 6
 """Stretches of the drive that are looked at, and the instants of each."""
-LEAST_STEP = 0.6
+MIN_STEP = 0.6
 """Meters between two instants: from nearer ones rays say nothing."""
 FEWEST = 20
 """Observations of an image, below which it says nothing."""
@@ -263,7 +263,7 @@ def _stretches(views: Sequence[View]) -> list[list[int]]:
         by_instant.setdefault(view.indices[0], []).append(place)
     for instant, places in by_instant.items():
         position = views[places[0]].camera.position
-        if last is None or float((position - last).norm()) >= LEAST_STEP:
+        if last is None or float((position - last).norm()) >= MIN_STEP:
             instants.append(instant)
             last = position
     starts = spread(max(len(instants) - INSTANTS + 1, 1), min(BLOCKS, max(len(instants) // INSTANTS, 1)))

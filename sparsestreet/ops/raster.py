@@ -7,7 +7,7 @@ from torch import Tensor
 
 from sparsestreet.demand import DemandError
 
-LEAST_ALPHA = 1e-6
+MIN_ALPHA = 1e-6
 """Depth is divided by alpha, or by this where a pixel is emptier."""
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from sparsestreet.ops import reference
 from sparsestreet.ops.backend import disable_compile, resolve_backend
 from sparsestreet.ops.cpu import rasterizer as cpu
-from sparsestreet.ops.raster import LEAST_ALPHA, Raster
+from sparsestreet.ops.raster import MIN_ALPHA, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_gates, check_pixel_weights, check_structure
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
@@ -175,5 +175,5 @@ def _compose(raster: Raster, offsets: Tensor, background: Tensor | None) -> Rend
     rgb = raster.rgb
     if background is not None:
         rgb = rgb + raster.transmittance[..., None] * background
-    depth = raster.depth_sum / alpha.clamp(min=LEAST_ALPHA)
+    depth = raster.depth_sum / alpha.clamp(min=MIN_ALPHA)
     return Rendering(rgb, alpha, depth, raster.radii, offsets)

@@ -14,13 +14,13 @@ from sparsestreet.types import Camera, Gaussians, Side
 
 LONGEST_SIDE = 1 << 22
 """Longest side of an image, pixels: up to here all pixel centers are exact in float32."""
-MOST_PIXELS = 1 << 29
+MAX_PIXELS = 1 << 29
 """Most pixels of an image: the indices of its three channels then fit the 32-bit integers of the GPU's kernels."""
 RIGID_TOLERANCE = 1e-3
 """Largest entry of R R^T - I. Poses in text files keep four digits or more; a pose with scale or shear is further off.
 
 An error of 1e-3 moves a point at the edge of an image by a pixel."""
-LARGEST_DISTORTION = 1e12
+MAX_DISTORTION = 1e12
 """Largest coefficient of a lens: no real one comes near, and its powers stay finite in float32."""
 _GOOD: set[tuple[object, ...]] = set()
 """Numbers of cameras that were found good; a log has some thousands."""
@@ -127,9 +127,9 @@ def _check_size(camera: Camera) -> None:
         raise ValueError(
             f"the image may be at most {LONGEST_SIDE} pixels wide and high, got {width}x{height}: render it in parts"
         )
-    if width * height > MOST_PIXELS:
+    if width * height > MAX_PIXELS:
         raise ValueError(
-            f"the image may have at most {MOST_PIXELS} pixels, got {width}x{height}: render it in parts, each with its "
+            f"the image may have at most {MAX_PIXELS} pixels, got {width}x{height}: render it in parts, each with its "
             "own principal point"
         )
 
@@ -189,9 +189,9 @@ def _dot(a: Sequence[float], b: Sequence[float]) -> float:
 def _check_effects(camera: Camera) -> None:
     if camera.distortion is not None:
         given = camera.distortion.tolist()
-        if tuple(camera.distortion.shape) != (5,) or not all(abs(value) <= LARGEST_DISTORTION for value in given):
+        if tuple(camera.distortion.shape) != (5,) or not all(abs(value) <= MAX_DISTORTION for value in given):
             raise ValueError(
-                f"camera.distortion must be 5 numbers of at most {LARGEST_DISTORTION:g}, got {given}: check k1, k2, "
+                f"camera.distortion must be 5 numbers of at most {MAX_DISTORTION:g}, got {given}: check k1, k2, "
                 "p1, p2, k3 against the calibration"
             )
     if camera.shutter is None:

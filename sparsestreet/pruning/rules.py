@@ -28,7 +28,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import render
 from sparsestreet.types import Frame, LeaveOneOut, View
 
-LEAST_ERROR = 1e-12
+MIN_ERROR = 1e-12
 """Squared error (images lie in [0, 1]) that stands for no error; its inverse fits into float32."""
 
 
@@ -133,7 +133,7 @@ class LeaveOneOutRule(PruningRule):
         rows = max(span.stop for span in spans.values())
         largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
         # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
-        share = (1 / errors.clamp(min=LEAST_ERROR)).float()
+        share = (1 / errors.clamp(min=MIN_ERROR)).float()
         for frame in on_device(scene, frames, ranks):
             for view, weights in self._seen(frame, share):
                 change = _without_each(scene, view, weights, context)

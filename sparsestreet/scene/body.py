@@ -160,7 +160,7 @@ def _projected(field: Field, points: Float64[np.ndarray, "n 3"]) -> Float64[np.n
 
 _BLEND = 0.01
 """Meters over which two capsules blend into each other."""
-_MOST_JOINTS = 4
+_MAX_JOINTS = 4
 """Largest number of joints that move one vertex, as in SMPL."""
 _FALLOFF = 4
 """Power of the distance by which a bone's weight falls off."""
@@ -251,7 +251,7 @@ class _Capsules:
         weights = np.zeros((len(points), NUM_JOINTS))
         for joint, column in zip(self.joints, hold.T, strict=True):
             weights[:, joint] += column
-        weakest = np.sort(weights, 1)[:, -_MOST_JOINTS - 1, None]
+        weakest = np.sort(weights, 1)[:, -_MAX_JOINTS - 1, None]
         # Subtract the strongest weight that is left out: a joint then has weight 0 where another takes its place.
         kept = np.clip(weights - weakest, 0, None)
         return kept / kept.sum(1, keepdims=True)
@@ -321,7 +321,7 @@ def _numbers(stored: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Fl
     return values
 
 
-_LEAST_STEP = 1e-9
+_MIN_STEP = 1e-9
 """Of normalized time, far below that from one frame to the next."""
 
 
@@ -398,7 +398,7 @@ def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
     known, rotations = times[usable], rotations[usable]
     upper = torch.searchsorted(known, times).clamp(max=len(known) - 1)
     lower = (torch.searchsorted(known, times, right=True) - 1).clamp(min=0)
-    step = (known[upper] - known[lower]).clamp(min=1 if track.times is None else _LEAST_STEP)
+    step = (known[upper] - known[lower]).clamp(min=1 if track.times is None else _MIN_STEP)
     fraction = ((times - known[lower]) / step).clamp(0, 1).float()
     return quat.slerp(rotations[lower], rotations[upper], fraction[:, None].expand(-1, 24))
 

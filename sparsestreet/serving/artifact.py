@@ -29,11 +29,11 @@ from sparsestreet.serving.renderer import ServedScene, frame_from_box
 DEFAULT_CAR = (4.8, 1.9, 1.6)
 """Length, width, height of the vehicle, meters; the rear axle is 1 m before its rear end."""
 _REAR = 1.0
-_LEAST_FRAME_US = 1
+_MIN_FRAME_US = 1
 """AlpaSim asks for frames that end after they start."""
 _LONGEST_SHUTTER_US = 50_000
 """That a simulation may ask for: AlpaSim's own are 15,000 to 30,000."""
-_FEWEST_POSES = 4
+_MIN_POSES = 4
 """Of a track: AlpaSim draws a spline through them. Objects seen less often stay as they were recorded."""
 _WHEN = (1980, 1, 1, 0, 0, 0)
 """Of the files in the zip: equal scenes give equal bytes."""
@@ -136,7 +136,7 @@ def _frames(views: RecordedViews, camera: RigCamera, rig: Rig) -> list[list[int]
             middle = rig.clock.microseconds(view.time)
             end = middle + half
             if first + _LONGEST_SHUTTER_US <= end <= last:
-                frames.append([min(middle - half, end - _LEAST_FRAME_US), end])
+                frames.append([min(middle - half, end - _MIN_FRAME_US), end])
     if not frames:
         raise ValueError(
             f"AlpaSim starts with an image {_LONGEST_SHUTTER_US // 1000} ms or more behind the first pose, and not "
@@ -150,7 +150,7 @@ def _tracks(served: ServedScene) -> dict[str, Any]:
     names, classes, stamps, poses, sizes = [], [], [], [], []
     for name, (_, node, instance) in objects_of(served.stored.scene).items():
         times = node.keyframe_times[instance][node.keyframe_valid[instance]].tolist()
-        if len(times) < _FEWEST_POSES:
+        if len(times) < _MIN_POSES:
             continue
         names.append(name)
         classes.append(node.classes[instance] or "automobile")

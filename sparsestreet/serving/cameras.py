@@ -55,7 +55,7 @@ class Turns:
 Pose = Float64[np.ndarray, "4 4"]
 """a_from_b of a message's ``Pose``: the place of b in a, and how it is turned."""
 
-LARGEST_SIDE, MOST_PIXELS = 8192, 36_000_000
+MAX_SIDE, MAX_PIXELS = 8192, 36_000_000
 """Of an image: 36 million pixels take about 1 GB while they are rendered."""
 FARTHEST = 1e6
 """Meters from the origin of the world, which lies in the street."""
@@ -119,10 +119,10 @@ def lens_of(spec: Any, height: int, width: int) -> Camera:
         raise NotServedError(f"camera {name} looks through a windshield, which is not simulated: leave it out")
     sizes = spec.resolution_w or width, spec.resolution_h or height
     for side in (*sizes, width, height):
-        if not 1 <= side <= LARGEST_SIDE:
-            raise ValueError(f"images of camera {name} have 1 to {LARGEST_SIDE} pixels a side, got {side}")
-    if width * height > MOST_PIXELS:
-        raise ValueError(f"images of camera {name} have at most {MOST_PIXELS:,} pixels, got {width} x {height}")
+        if not 1 <= side <= MAX_SIDE:
+            raise ValueError(f"images of camera {name} have 1 to {MAX_SIDE} pixels a side, got {side}")
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"images of camera {name} have at most {MAX_PIXELS:,} pixels, got {width} x {height}")
     intrinsics = _intrinsics(spec.opencv_pinhole_param, name, sizes)
     distortion = _distortion(spec.opencv_pinhole_param, name)
     if distortion is not None:
@@ -231,7 +231,7 @@ DEFAULT_MOUNT = (1.5, 0.0, 1.6)
 """Meters ahead, left and up of the rear axle on the ground: about where a car's front camera is."""
 BEYOND = 60.0
 """Seconds before the first and after the last image at which the street is still shown, as it was then."""
-_LEAST_UP = 0.5
+_MIN_UP = 0.5
 """Cosine between z and the first camera's upright below which z is not up."""
 
 
@@ -393,7 +393,7 @@ def _below_camera(
     poses = []
     for view in own:
         world_from_camera = _pose(view)
-        if -world_from_camera[2, 1] < _LEAST_UP:
+        if -world_from_camera[2, 1] < _MIN_UP:
             raise ValueError(
                 "z of the world is not up, so nobody knows where the ground is: train on a log with the vehicle's poses"
             )

@@ -35,13 +35,13 @@ from sparsestreet.types import View
 
 log = logging.getLogger(__name__)
 
-LARGEST_MESSAGE = 64 * 2**20
+MAX_MESSAGE = 64 * 2**20
 """Bytes: that of AlpaSim's channel to its renderer."""
-MOST_WAITING = 256
+MAX_WAITING = 256
 """Requests at the same time; further ones get RESOURCE_EXHAUSTED."""
 WHOLE_MESSAGE = 60.0
 """Seconds within which the message of a call must have come; a call without one holds a place of all."""
-_MOST_CAMERAS = 64
+_MAX_CAMERAS = 64
 """Of a batch."""
 _ELSEWHERE = 2.0
 """Meters from all recorded cameras; farther away, pictures hold what none of them saw."""
@@ -90,10 +90,8 @@ class Sensorsim:
     def batch_render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
         """Each camera once; one that fails says why and leaves the others as they are."""
         names = [item.camera_name for item in request.items]
-        if len(set(names)) < len(names) or len(names) > _MOST_CAMERAS:
-            raise ValueError(
-                f"a batch has at most {_MOST_CAMERAS} cameras, each once, got {names[: _MOST_CAMERAS + 1]}"
-            )
+        if len(set(names)) < len(names) or len(names) > _MAX_CAMERAS:
+            raise ValueError(f"a batch has at most {_MAX_CAMERAS} cameras, each once, got {names[: _MAX_CAMERAS + 1]}")
         started: list[tuple[str, Future[bytes] | Exception]] = []
         for item in request.items:
             one = item.request
@@ -196,12 +194,12 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
     """
     check_address(host, port)
     service = Sensorsim(scenes, encoders=workers)
-    size = [(f"grpc.max_{way}_message_length", LARGEST_MESSAGE) for way in ("send", "receive")]
+    size = [(f"grpc.max_{way}_message_length", MAX_MESSAGE) for way in ("send", "receive")]
     # Two servers on one port would share its requests.
     server = grpc.server(
         ThreadPoolExecutor(workers, "serve"),
         options=[*size, ("grpc.so_reuseport", 0)],
-        maximum_concurrent_rpcs=MOST_WAITING,
+        maximum_concurrent_rpcs=MAX_WAITING,
     )
     calls = {name: _handler(getattr(service, name), *kinds) for name, kinds in wire.METHODS.items()}
     handlers = [grpc.method_handlers_generic_handler(name, calls) for name in wire.SERVICES]

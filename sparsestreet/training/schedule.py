@@ -125,7 +125,7 @@ def milestone(fraction: float, course: Course) -> int:
     return max(1, last_step(fraction, course))
 
 
-LEAST_SIDE = 11
+MIN_SIDE = 11
 """Pixels: SSIM's window. Images are not made smaller than this."""
 
 
@@ -160,7 +160,7 @@ class ResolutionSchedule:
         if not self.halvings:
             return frame
         side = min(frame.camera.width, frame.camera.height)
-        divisor = min(self.divisor(step, course), max(side // LEAST_SIDE, 1))
+        divisor = min(self.divisor(step, course), max(side // MIN_SIDE, 1))
         return frame if divisor == 1 else smaller(frame, divisor)
 
 

@@ -163,7 +163,7 @@ Near ones look alike, far ones give parallax. At 8 m/s and 10 Hz these are the f
 OTHER_CAMERA = (0.0, 3.0)
 """The same for every other camera of the rig: at the same instant, and later, when it looks where this one looked."""
 
-LEAST_BASELINE = 0.05
+MIN_BASELINE = 0.05
 """Least distance of two images, meters; nearer ones have no parallax."""
 
 PROBE_DEPTHS = (6.0, 15.0, 40.0)
@@ -172,7 +172,7 @@ PROBE_DEPTHS = (6.0, 15.0, 40.0)
 PROBE_GRID = (5, 4)
 """Columns and rows of rays through an image. The points at all depths on these rays are the image's probes."""
 
-LEAST_OVERLAP = 0.1
+MIN_OVERLAP = 0.1
 """Least share of the probes that the other image must see."""
 
 
@@ -193,9 +193,9 @@ def image_pairs(views: Sequence[View], cameras_from_frame: Float64[np.ndarray, "
         probes = (_probes(view.camera) - translation[first]) @ rotation[first]
         for second in _partners(first, instants, cameras, away):
             # Two cameras of one instant choose each other, but their matches must not count twice.
-            if away[second] >= LEAST_BASELINE and (second, first) not in found:
+            if away[second] >= MIN_BASELINE and (second, first) not in found:
                 seen = in_image(views[second].camera, cameras_from_frame[second], probes)
-                if seen.mean() >= LEAST_OVERLAP:
+                if seen.mean() >= MIN_OVERLAP:
                     found[first, second] = None
     return list(found)
 

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.evidence.poses import LEAST_NOISE, PRIOR, adjust
+from sparsestreet.evidence.poses import MIN_NOISE, PRIOR, adjust
 from sparsestreet.triangulation.points import Observations, meet
 
 IMAGES, POINTS, FOCAL = 3, 12, 8.0
@@ -37,7 +37,7 @@ def test_corrections_are_the_least_squares_of_rays_and_prior():
         corrections, points = np.split(unknown, [6 * IMAGES])
         pixels = FOCAL * (imaged(moved(recorded, corrections.reshape(-1, 6)), points.reshape(-1, 3)) - rays)
         # Geman and McClure: the square s becomes s / (1 + s), here of three times the noise.
-        pixels = pixels.reshape(-1, 2) / LEAST_NOISE
+        pixels = pixels.reshape(-1, 2) / MIN_NOISE
         robust = pixels / np.sqrt(1 + np.square(pixels / 3).sum(1, keepdims=True))
         return np.concatenate((robust.ravel(), corrections / np.tile(PRIOR, IMAGES)))
 

@@ -292,7 +292,7 @@ def _broken(path: Path, line: int, message: str) -> LogError:
 
 
 _PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")
-_LARGEST_IMAGE = 100_000
+_MAX_IMAGE = 100_000
 
 
 @dataclass(frozen=True)
@@ -350,7 +350,7 @@ def _cameras(path: Path) -> Iterator[CameraRow]:
 
 def _camera(row: CameraRow, path: Path) -> tuple[Lens, tuple[int, int]]:
     width, height = row.size
-    if not (0 < width <= _LARGEST_IMAGE and 0 < height <= _LARGEST_IMAGE):
+    if not (0 < width <= _MAX_IMAGE and 0 < height <= _MAX_IMAGE):
         message = f"camera {row.number} has images of {width}x{height} pixels"
         raise fault(path, message, "write the size of its images")
     return lens_of(row.model, row.numbers, path, row.number), row.size

@@ -31,7 +31,7 @@ _HARMLESS = (
     "colmap_im_id", "rotation", "comment",
 )  # fmt: skip
 """What was done before the file was written, or how another program sets up its own volume."""
-_LARGEST_IMAGE = 100_000
+_MAX_IMAGE = 100_000
 """Pixels on a side."""
 
 
@@ -158,7 +158,7 @@ def _is_fisheye(model: JsonValue | None, flag: JsonValue | None) -> bool:
 def _size(width: JsonValue | None, height: JsonValue | None, image: Path) -> tuple[int, int]:
     if width is None or height is None:
         return image_size(image)
-    return width.whole(1, _LARGEST_IMAGE), height.whole(1, _LARGEST_IMAGE)
+    return width.whole(1, _MAX_IMAGE), height.whole(1, _MAX_IMAGE)
 
 
 def _focal(top: JsonValue, frame: JsonValue, key: str, angle: str, pixels: int, otherwise: float | None) -> float:

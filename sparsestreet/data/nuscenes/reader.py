@@ -27,7 +27,7 @@ from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, Record
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.geometry.cameras import transform_points
 
-_LARGEST_SIDE = 1 << 14
+_MAX_SIDE = 1 << 14
 """Pixels; genuine images have 1600x900."""
 EGO_ROWS = {"CAM_BACK": 80}
 """Channel -> how many of the lowest rows show the recording car (neurad-studio's nuScenes reader)."""
@@ -38,7 +38,7 @@ _HEIGHT = 900
 
 def recorded_size(files: Sequence[DataFile]) -> tuple[int, int]:
     """(width, height) of a camera's images, as sample_data says. Raises LogError where they differ."""
-    sizes = [(file.row.count("width", _LARGEST_SIDE), file.row.count("height", _LARGEST_SIDE)) for file in files]
+    sizes = [(file.row.count("width", _MAX_SIDE), file.row.count("height", _MAX_SIDE)) for file in files]
     for file, size in zip(files, sizes, strict=True):
         if size != sizes[0] or 0 in size:
             raise file.row.fault("width, height", f"must be positive, and those of the camera, {sizes[0]}", size)

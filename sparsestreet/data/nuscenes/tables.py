@@ -22,9 +22,9 @@ _CHUNK = 1 << 22
 """Bytes read at a time."""
 _LONGEST_ROW = 1 << 20
 """Bytes; genuine rows have below 1 kB."""
-_LARGEST_WHOLE = 1 << 26
+_MAX_WHOLE = 1 << 26
 """Bytes of a table that is parsed at once; the largest genuine one, scene.json, has below 1 MB."""
-_MOST_ROWS = 1_000_000
+_MAX_ROWS = 1_000_000
 """Rows of one scene in one table; a genuine scene of 20 s has about 5,000 files."""
 _LAST_STAMP = 2**63 // 1000
 """Microseconds whose nanoseconds 64 bits hold."""
@@ -90,8 +90,8 @@ class Row:
 
 def all_rows(path: Path) -> list[Row]:
     """Every row of a small table. Raises LogError for a file that is none."""
-    if path.is_file() and path.stat().st_size > _LARGEST_WHOLE:
-        raise fault(path, f"the table has {path.stat().st_size} bytes, more than {_LARGEST_WHOLE}", REMEDY)
+    if path.is_file() and path.stat().st_size > _MAX_WHOLE:
+        raise fault(path, f"the table has {path.stat().st_size} bytes, more than {_MAX_WHOLE}", REMEDY)
     try:
         check_regular(path)
         rows = json.loads(path.read_bytes())
@@ -114,8 +114,8 @@ def rows_where(path: Path, field: str, wanted: Collection[str]) -> list[Row]:
     found: list[Row] = []
     for piece in _pieces(path):
         found += [_row(path, field, piece, match) for match in pattern.finditer(piece) if match[1] in tokens]
-        if len(found) > _MOST_ROWS:
-            raise fault(path, f"more than {_MOST_ROWS} rows belong to one scene", REMEDY)
+        if len(found) > _MAX_ROWS:
+            raise fault(path, f"more than {_MAX_ROWS} rows belong to one scene", REMEDY)
     return found
 
 

@@ -104,7 +104,7 @@ def _packed(folder: Path, frame: int) -> Path:
 
 
 PER_SECOND = 1_000_000_000
-_LARGEST_JSON = 16_000_000
+_MAX_JSON = 16_000_000
 """Bytes. Poses of a sequence take 17 kB."""
 _LATEST = 2**63 // PER_SECOND
 _REMEDY = "fetch the file again"
@@ -233,7 +233,7 @@ _SHAPES = ("position", "dimensions")
 def _json(path: Path, parse_float: Callable[[str], Any] = float) -> Any:
     if not path.is_file():
         raise fault(path, "the file is missing", _REMEDY)
-    if path.stat().st_size > _LARGEST_JSON:
+    if path.stat().st_size > _MAX_JSON:
         raise fault(path, f"it has {path.stat().st_size} bytes, as no file of its kind has", _REMEDY)
     try:
         check_regular(path)

@@ -15,7 +15,7 @@ from sparsestreet.data.rig_json.values import read_lens, read_pose, read_shutter
 from sparsestreet.geometry.lenses import Lens
 from sparsestreet.types import Side
 
-_LARGEST_IMAGE = 100_000
+_MAX_IMAGE = 100_000
 _COLUMNS = ("x", "y", "z", "intensity")
 
 
@@ -133,7 +133,7 @@ def _camera(name: str, value: JsonValue) -> CameraEntry:
         raise value.fault("is no name of a camera", "name it as a folder may be named")
     mount, mask, exposure = value.get("vehicle_from_camera"), value.get("ego_mask"), value.get("exposure")
     readout, side = read_shutter(value.get("shutter"))
-    size = value["width"].whole(1, _LARGEST_IMAGE), value["height"].whole(1, _LARGEST_IMAGE)
+    size = value["width"].whole(1, _MAX_IMAGE), value["height"].whole(1, _MAX_IMAGE)
     return CameraEntry(
         read_lens(value["lens"]),
         size,

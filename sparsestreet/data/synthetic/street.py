@@ -310,7 +310,7 @@ def _count(indices: Int16[np.ndarray, "..."], actors: int) -> np.ndarray:
 
 GENERATOR = 3
 """Version of the generator; raised whenever equal settings would give another street."""
-MOST_WORKERS = 16
+MAX_WORKERS = 16
 """Frames that are traced at once, at most: one of 960x640 with three cameras takes 0.4 GB and 10 s of a core."""
 _LATER = frozenset(
     {
@@ -396,7 +396,7 @@ def _write(settings: StreetSettings, folder: Path, progress: Callable[[int, int]
 def _frames(settings: StreetSettings, world: World) -> Iterator[StreetFrame]:
     """Yield all frames in order, rendered by threads, because NumPy releases the interpreter while it computes."""
     pending: deque[Future[StreetFrame]] = deque()
-    workers = max(2, min(MOST_WORKERS, torch.get_num_threads()))
+    workers = max(2, min(MAX_WORKERS, torch.get_num_threads()))
     executor = ThreadPoolExecutor(workers)
     try:
         for index in range(settings.num_frames):

@@ -35,7 +35,7 @@ from sparsestreet.data.waymo.v2 import TableSegment
 
 _COMPONENTS = ("vehicle_pose", "camera_image", "camera_calibration", "lidar", "lidar_box")
 _RECORDS = ("*.tfrecord", "*/*.tfrecord", "*/*/*.tfrecord")
-_LARGEST_INDEX = 10**6
+_MAX_INDEX = 10**6
 """A number above is no place in a list but a name: Hydra takes the digits and underscores of one for a number."""
 
 
@@ -90,7 +90,7 @@ def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Pa
         if len(names) > 1:
             raise ValueError(f"data.log.scene must name one of the segments in {root}: {shown}")
         return names[0]
-    if isinstance(scene, int) and scene <= _LARGEST_INDEX:
+    if isinstance(scene, int) and scene <= _MAX_INDEX:
         scene = _at_place(scene, scenes, shown)
     if isinstance(scene, int):
         name = next((name for name in names if name.replace("_", "") == str(scene)), str(scene))

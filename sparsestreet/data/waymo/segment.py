@@ -27,7 +27,7 @@ CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SI
 LIDARS = {1: "TOP", 2: "FRONT", 3: "SIDE_LEFT", 4: "SIDE_RIGHT", 5: "REAR"}
 CLASSES = {1: "Vehicle", 2: "Pedestrian", 3: "Sign", 4: "Cyclist"}
 REMEDY = "download the file again from Waymo"
-_LARGEST_SIDE = 16_384
+_MAX_SIDE = 16_384
 """Pixels: ten times what the cameras have."""
 _LONGEST_EXPOSURE = 0.5
 """Seconds from the trigger to the end of the readout: ten times what was seen."""
@@ -198,7 +198,7 @@ def camera_calibration(
     if len(intrinsic) != 9 or not np.isfinite(intrinsic).all() or min(intrinsic[:2]) <= 0:
         message = f"{what} has the intrinsics {[float(value) for value in intrinsic][:12]}"
         raise fault(path, f"{message}, not nine numbers with focal lengths above 0", REMEDY)
-    if not all(0 < side <= _LARGEST_SIDE for side in size):
+    if not all(0 < side <= _MAX_SIDE for side in size):
         raise fault(path, f"{what} has images of {size[0]}x{size[1]} pixels", REMEDY)
     if direction not in range(6):
         raise fault(path, f"{what} has the rolling_shutter_direction {direction}, not one of 0 to 5", REMEDY)

@@ -38,7 +38,7 @@ from sparsestreet.data.waymo.segment import (
 
 SEGMENT, FRAME = "key.segment_context_name", "key.frame_timestamp_micros"
 CAMERA, LASER, OBJECT = "key.camera_name", "key.laser_name", "key.laser_object_id"
-_LARGEST_TABLE = 256_000_000
+_MAX_TABLE = 256_000_000
 """Bytes of small columns that are held at once; those of a segment take a few million."""
 _BYTES_OF_A_ROW, _BYTES_OF_A_CELL = 256, 64
 """What Python takes for either at least, however few bytes code them: sixty million equal cells fit into 400 kB."""
@@ -123,7 +123,7 @@ class Table:
         self._check_size(names, decoded)
         columns: list[list[Any]] = [[] for _ in names]
         # No cell is larger than the bytes that code all of them.
-        rows = max(1, min(_LARGEST_TABLE // max(coded, 1), 65536))
+        rows = max(1, min(_MAX_TABLE // max(coded, 1), 65536))
         for batch in self._file.iter_batches(rows, columns=names, use_threads=False):
             decoded += batch.nbytes
             self._check_size(names, decoded)
@@ -132,7 +132,7 @@ class Table:
         return columns
 
     def _check_size(self, names: Sequence[str], size: int) -> None:
-        if size > _LARGEST_TABLE:
+        if size > _MAX_TABLE:
             message = f"the columns {', '.join(names[:3])} ... take {size} bytes, a segment's take a few million"
             raise fault(self.path, message, REMEDY)
 

@@ -177,7 +177,7 @@ BOX_MARGIN = 0.01
 """Pixels by which boxes are widened before culling, so that rounding never decides about a touched pixel."""
 COMPENSATION_FLOOR = 0.005
 """Least antialias compensation (gsplat 1.6); below it the ratio of determinants has no correct digits."""
-LEAST_OPACITY = 2.0**-126
+MIN_OPACITY = 2.0**-126
 """Smallest normal float32. The fast backends keep log2 of the opacity, which loses digits below it."""
 DETERMINANT_MIN = 1e-12
 """Least determinant, px^4. Only without blur are splats thinner; they touch no pixel center, their conic overflows."""
@@ -213,7 +213,7 @@ def row_reasons(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -
     size = torch.tensor([camera.width, camera.height], dtype=depths.dtype, device=depths.device)
     box = splats.half_boxes + BOX_MARGIN
     inside = ((splats.means + box >= 0.5) & (splats.means - box <= size - 0.5)).all(-1)
-    faint = ~(splats.opacities >= max(settings.alpha_min, LEAST_OPACITY))
+    faint = ~(splats.opacities >= max(settings.alpha_min, MIN_OPACITY))
     reasons[rows] = first_reason(splats.refusals | {Reason.FAINT: faint, Reason.OUTSIDE: ~inside})
     return reasons
 

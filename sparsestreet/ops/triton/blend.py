@@ -57,9 +57,9 @@ QUADRANT_PIXELS = 64
 QUADRANT_SIZE = constant(QUADRANT_PIXELS)
 WARP = constant(32)
 QUADRANT_SHIFT = 28
-MOST_ROWS = 1 << QUADRANT_SHIFT
+MAX_ROWS = 1 << QUADRANT_SHIFT
 """Most rows: a pair stores its row and its quadrants in 32 bits."""
-ROW = constant(MOST_ROWS - 1)
+ROW = constant(MAX_ROWS - 1)
 SHIFT = constant(QUADRANT_SHIFT)
 ALL = constant(15)
 

@@ -75,7 +75,7 @@ then all arguments: tensors by address, and constants too."""
 _INT32 = 1 << 31
 _DTYPE = attrgetter("dtype")
 _NONE: dict[str, Any] = {}
-_MOST_NUMBERS = 256
+_MAX_NUMBERS = 256
 """Most numbers that are kept for a kernel, because counts of rows are new in many views."""
 _PLANS: dict[tuple, "_Plan"] = {}
 
@@ -148,7 +148,7 @@ class _Plan:
                 if isinstance(compiled, CompiledKernel) and _is_known(triton.__version__):
                     self._by_kind[kind] = compiled
                 return
-            if len(self._by_numbers) >= _MOST_NUMBERS:
+            if len(self._by_numbers) >= _MAX_NUMBERS:
                 self._by_numbers.clear()
             self._by_numbers[key] = compiled
         # Constants only fill their places in the signature; the machine code has them already.

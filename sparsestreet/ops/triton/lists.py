@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sparsestreet.ops.raster import PairLimitError
 from sparsestreet.ops.triton import view as record
-from sparsestreet.ops.triton.blend import MOST_ROWS, QUADRANT_SHIFT, WARP, half_spans, touched_quadrants
+from sparsestreet.ops.triton.blend import MAX_ROWS, QUADRANT_SHIFT, WARP, half_spans, touched_quadrants
 from sparsestreet.ops.triton.launch import constant, jit, launch, vectors
 from sparsestreet.ops.triton.parts import LENGTH, Parts, Room, Sizes, list_by_tile, store_sizes
 from sparsestreet.ops.triton.project import block_of
@@ -126,7 +126,7 @@ class Lists:
     @property
     def rows_of_pairs(self) -> Int[Tensor, " p"]:
         """``pair_rows`` without the quadrants."""
-        return self.pair_rows & (MOST_ROWS - 1)
+        return self.pair_rows & (MAX_ROWS - 1)
 
     @property
     def quadrants_of_pairs(self) -> Int[Tensor, " p"]:

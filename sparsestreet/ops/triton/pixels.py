@@ -8,7 +8,7 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sparsestreet.ops.raster import LEAST_ALPHA
+from sparsestreet.ops.raster import MIN_ALPHA
 from sparsestreet.ops.triton import blend, gradients
 from sparsestreet.ops.triton.blend import PIXELS
 from sparsestreet.ops.triton.launch import constant, jit, launch
@@ -19,7 +19,7 @@ from sparsestreet.ops.triton.view import TILE, TILE_SIZE, KernelView
 
 _BLOCK = 512
 _OPTIONS = {"enable_fp_fusion": False}
-LEAST = constant(LEAST_ALPHA)
+LEAST = constant(MIN_ALPHA)
 
 
 @dataclass(frozen=True)

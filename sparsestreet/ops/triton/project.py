@@ -43,9 +43,9 @@ from sparsestreet.ops.triton.view import (
 LOG2_SCALE = constant(math.sqrt(math.log2(math.e) / 2))
 TWO_LN2 = constant(2 * math.log(2))
 HALF_LOG2_E = constant(math.log2(math.e) / 2)
-# Of ops/reference: COMPENSATION_FLOOR squared, LEAST_OPACITY and DETERMINANT_MIN.
+# Of ops/reference: COMPENSATION_FLOOR squared, MIN_OPACITY and DETERMINANT_MIN.
 RATIO_FLOOR = constant(2.5e-5)
-LEAST_OPACITY = constant(2.0**-126)
+MIN_OPACITY = constant(2.0**-126)
 DETERMINANT_MIN = constant(1e-12)
 LARGEST = constant(3.4028234663852886e38)
 
@@ -345,7 +345,7 @@ def project_rows(
     variance_x, variance_y, determinant = blurred(view, shape[2], shape[3], shape[5])
     seen = seen & sees & (determinant >= DETERMINANT_MIN) & (determinant <= LARGEST) & (dot(mean, mean) <= LARGEST)
     effective = opacity * compensation(shape[5], determinant, ANTIALIAS)
-    seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective >= LEAST_OPACITY)
+    seen = seen & (effective >= tl.load(view + ALPHA_MIN)) & (effective >= MIN_OPACITY)
 
     x, y = shape[0], shape[1]
     half_x, half_y = half_box(view, effective, variance_x, variance_y, BOUNDED)

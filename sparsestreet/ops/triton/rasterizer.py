@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend
-from sparsestreet.ops.triton.blend import MOST_ROWS
+from sparsestreet.ops.triton.blend import MAX_ROWS
 from sparsestreet.ops.triton.counters import CHANGE_COUNT, COUNTER_COUNT, count_tiles_pixels, remove_from_tiles
 from sparsestreet.ops.triton.gradients import GATE_PLACE, OPTIONS, ROWS, block_of, project_rows_backward, sum_slots
 from sparsestreet.ops.triton.launch import is_interpreted, launch
@@ -168,7 +168,7 @@ def _sum_slots(values: Tensor, lists: Lists, sums: Tensor, padded: int, kind: tl
 
 def _check(gaussians: Gaussians) -> None:
     means = gaussians.means
-    if len(gaussians) > MOST_ROWS:
+    if len(gaussians) > MAX_ROWS:
         raise ValueError(f"backend 'triton' takes at most 2^28 rows, got {len(gaussians)}: render a part of them")
     if means.dtype != torch.float32:
         raise ValueError(

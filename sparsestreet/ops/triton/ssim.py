@@ -25,7 +25,7 @@ TAPS = constant(window())
 COUNT = constant(WINDOW)
 PAD = constant(WINDOW - 1)
 CHANNELS = constant(3)
-MOST_NUMBERS = 1 << 31
+MAX_NUMBERS = 1 << 31
 """Most numbers in the three maps of derivatives, because kernels count in int32."""
 TWICE_C1, TWICE_C2 = constant(2 * C1), constant(2 * C2)
 
@@ -33,9 +33,9 @@ TWICE_C1, TWICE_C2 = constant(2 * C1), constant(2 * C2)
 def mean_ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
     """``sparsestreet.ops.ssim.ssim`` of contiguous float32 images; raises ValueError above 239 million pixels."""
     height, width, _ = image.shape
-    if 9 * (height - WINDOW + 1) * (width - WINDOW + 1) > MOST_NUMBERS:
+    if 9 * (height - WINDOW + 1) * (width - WINDOW + 1) > MAX_NUMBERS:
         raise ValueError(
-            f"SSIM by backend 'triton' takes images of up to {MOST_NUMBERS // 9 / 1e6:.0f} million pixels, got "
+            f"SSIM by backend 'triton' takes images of up to {MAX_NUMBERS // 9 / 1e6:.0f} million pixels, got "
             f"{width}x{height}: use smaller images or backend='torch'"
         )
     return _MeanSSIM.apply(image, truth)

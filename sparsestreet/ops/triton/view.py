@@ -101,7 +101,7 @@ def zipped(columns, WIDTH: tl.constexpr):
 
 TILE_SIZE = 16
 TILE = constant(TILE_SIZE)
-LEAST_LIGHT = 1e-30
+MIN_LIGHT = 1e-30
 """As in ops/cpu: a pixel stops at this light at the latest."""
 
 # Places in the table.
@@ -155,7 +155,7 @@ class KernelView:
         key = numbers_of(camera), settings
         view = _VIEWS.get(key)
         if view is None:
-            if len(_VIEWS) >= _MOST_VIEWS:
+            if len(_VIEWS) >= _MAX_VIEWS:
                 _VIEWS.clear()
             view = _VIEWS[key] = KernelView(camera, settings)
         return view
@@ -190,7 +190,7 @@ class KernelView:
     @cached_property
     def transmittance_min(self) -> float:
         """Never 0, because backward divides the light that is left, which must not vanish."""
-        return max(self.settings.transmittance_min, LEAST_LIGHT)
+        return max(self.settings.transmittance_min, MIN_LIGHT)
 
     def table(self, device: torch.device) -> Float[Tensor, " numbers"]:
         """The numbers on the device, rounded from float64: one small copy when a stream first asks."""
@@ -202,7 +202,7 @@ class KernelView:
         return table
 
 
-_MOST_VIEWS = 1 << 12  # the cameras of a log; half a kilobyte of the device each
+_MAX_VIEWS = 1 << 12  # the cameras of a log; half a kilobyte of the device each
 _VIEWS: dict[tuple, KernelView] = {}
 
 

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestreet.evidence.exposure import EV, FEWEST_INSTANTS, GainErrors, ImageGains, gain_errors, image_gains
+from sparsestreet.evidence.exposure import EV, MIN_INSTANTS, GainErrors, ImageGains, gain_errors, image_gains
 from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.pictures.images import Dots
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
@@ -51,7 +51,7 @@ class ExposureSettings(EffectSettings):
         gains = _measured(data)
         errors = None if gains is None else gain_errors(gains)
         if gains is None or errors is None:
-            few = f"images of fewer than {FEWEST_INSTANTS} instants share enough lidar points with their neighbors"
+            few = f"images of fewer than {MIN_INSTANTS} instants share enough lidar points with their neighbors"
             reason = f"{few}, so gains are not measured"
             return Finding(called_for=False, reason=reason, unit="EV", threshold=self.threshold)
         return Finding(

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sparsestreet.data.hood import LEAST_DRIVE
+from sparsestreet.data.hood import MIN_DRIVE
 from sparsestreet.pictures.images import Marked
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -41,7 +41,7 @@ class HoodSettings(EffectSettings):
         if not hoods:
             return Finding(
                 called_for=False,
-                reason=f"no camera of {log.name} moves by {LEAST_DRIVE:g} m, so what never changes may be the street",
+                reason=f"no camera of {log.name} moves by {MIN_DRIVE:g} m, so what never changes may be the street",
                 unit="of an image",
                 threshold=self.min_share,
                 missing="read a longer drive, or give masks of the car (data.log.masks)",
@@ -94,7 +94,7 @@ class DirtSettings(ReportedSettings):
         if not spots:
             return Finding(
                 called_for=False,
-                reason=f"no camera of {log.name} moves by {LEAST_DRIVE:g} m, so what never changes may be the street",
+                reason=f"no camera of {log.name} moves by {MIN_DRIVE:g} m, so what never changes may be the street",
                 unit="of an image",
                 threshold=self.min_share,
                 missing="read a longer drive, or give masks of the spots (data.log.masks)",

@@ -155,7 +155,7 @@ class GlobalShutter(Effect):
         return view if view.camera.shutter is None else replace(view, camera=replace(view.camera, shutter=None))
 
 
-MOST_MOMENTS = 5
+MAX_MOMENTS = 5
 _PIXELS_A_MOMENT = 3.0
 """A longer blur gets one moment more for each (docs/effects.md)."""
 _BLUR_NS_PER_ROW, _BLUR_NS_PER_PIXEL = 84.0, 134.0
@@ -219,9 +219,9 @@ class MotionBlurSettings(EffectSettings):
             (int(frame), int(camera)): Shutter(torch.tensor(moved), torch.tensor(turned), seconds=seconds, span=span)
             for (frame, camera), moved, turned, (seconds, span) in rows
         }
-        if header["moments"] not in range(1, MOST_MOMENTS + 1):  # their weights take a matrix, each of them an image
+        if header["moments"] not in range(1, MAX_MOMENTS + 1):  # their weights take a matrix, each of them an image
             raise ValueError(
-                f"an exposure has 1 to {MOST_MOMENTS} moments, got {header['moments']!r}: write the file again"
+                f"an exposure has 1 to {MAX_MOMENTS} moments, got {header['moments']!r}: write the file again"
             )
         return MotionBlur(self, motions, header["moments"])
 
@@ -265,7 +265,7 @@ def num_moments(pixels: float) -> int:
     >>> [num_moments(pixels) for pixels in (0.5, 3.0, 3.1, 8.0, 50.0)]
     [2, 2, 3, 4, 5]
     """
-    return min(max(1 + math.ceil(pixels / _PIXELS_A_MOMENT), 2), MOST_MOMENTS)
+    return min(max(1 + math.ceil(pixels / _PIXELS_A_MOMENT), 2), MAX_MOMENTS)
 
 
 @cache

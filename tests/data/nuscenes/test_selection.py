@@ -229,7 +229,7 @@ def test_a_table_that_is_parsed_at_once_has_a_limit(tmp_path):
 
 
 def test_more_rows_than_a_scene_has_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(tables, "_MOST_ROWS", 10)
+    monkeypatch.setattr(tables, "_MAX_ROWS", 10)
     written(tmp_path / "t.json", 200)
     with pytest.raises(LogError, match="more than 10 rows belong to one scene"):
         rows_where(tmp_path / "t.json", "sample_token", {"s3"})

@@ -229,7 +229,7 @@ def test_rows_that_few_bytes_code_are_counted_as_memory_holds_them(bomb, tmp_pat
     """Dictionaries and runs code any number of equal cells in some bytes; a tenth of the limit shows it as well."""
     from pyarrow import parquet
 
-    monkeypatch.setattr("sparsestreet.data.waymo.v2._LARGEST_TABLE", 25_600_000)
+    monkeypatch.setattr("sparsestreet.data.waymo.v2._MAX_TABLE", 25_600_000)
     count, size = {"equal rows": (2_000_000, 40), "long texts": (30_000, 10_000), "long lists": (3, 40)}[bomb]
     cells = pyarrow.DictionaryArray.from_arrays(np.zeros(count, np.int8), ["a" * size])
     if bomb == "long lists":

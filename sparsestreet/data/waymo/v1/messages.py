@@ -22,7 +22,7 @@ from sparsestreet.data.waymo.v1.wire import Message
 
 CONTEXT, STAMP, POSE, IMAGES, LASERS, LABELS = 1, 2, 3, 4, 5, 6
 NAME, JPEG, PANOPTIC = 1, 2, 10
-_LARGEST_UNPACKED = 64 * 2**20
+_MAX_UNPACKED = 64 * 2**20
 """Bytes: the poses of TOP's pixels take 4 million."""
 
 
@@ -99,7 +99,7 @@ def range_image(message: Message, field: int, channels: int) -> Float[np.ndarray
         return None
     unpacker = zlib.decompressobj()
     try:
-        unpacked = unpacker.decompress(packed, _LARGEST_UNPACKED)
+        unpacked = unpacker.decompress(packed, _MAX_UNPACKED)
     except zlib.error as error:
         raise message.error(f"field {field} cannot be unpacked ({error})") from error
     if not unpacker.eof:

@@ -12,7 +12,7 @@ from sparsestreet.data.problems import Problem, fault
 from sparsestreet.data.waymo.segment import REMEDY
 
 _HEADER, _FOOTER = 12, 4
-_MOST_RECORDS = 2_000
+_MAX_RECORDS = 2_000
 """Ten times the frames of a segment."""
 _GZIP = b"\x1f\x8b"
 
@@ -64,8 +64,8 @@ class Records:
             if length > end - place - _HEADER - _FOOTER:
                 message = f"{what}, says that it has {length} bytes, but {end - place - _HEADER} are left of the file"
                 raise fault(self.path, message, REMEDY)
-            if len(places) == _MOST_RECORDS:
-                raise fault(self.path, f"the file has more than {_MOST_RECORDS} records, a segment has 200", REMEDY)
+            if len(places) == _MAX_RECORDS:
+                raise fault(self.path, f"the file has more than {_MAX_RECORDS} records, a segment has 200", REMEDY)
             places.append((place + _HEADER, length))
             place += _HEADER + length + _FOOTER
         return places

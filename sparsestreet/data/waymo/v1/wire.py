@@ -15,7 +15,7 @@ from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.waymo.segment import REMEDY
 
 _VARINT, _EIGHT, _BYTES, _FOUR = 0, 1, 2, 5
-_MOST_BITS = 64
+_MAX_BITS = 64
 _SHIFT = 7
 
 Value = int | float | memoryview
@@ -138,7 +138,7 @@ class Message:
 
     def _varint(self, data: memoryview, place: int) -> tuple[int, int]:
         value = shift = 0
-        while place < len(data) and shift < _MOST_BITS:
+        while place < len(data) and shift < _MAX_BITS:
             byte = data[place]
             value |= (byte & 0x7F) << shift
             place, shift = place + 1, shift + _SHIFT
