@@ -157,7 +157,7 @@ run_tests() { # part, limit in seconds, arguments of pytest...
 }
 
 run_parity() {
-  local files=(tests/ops/triton/test_{parity,edges,lists,parts,gates}.py)
+  local files=(tests/ops/test_parity.py tests/ops/triton/test_{lists,parts,gates}.py -k triton)
   [ "$DRY" = 0 ] || files=(tests/ops/triton/test_work.py)
   run_tests parity 120 "${files[@]}"
 }
@@ -165,7 +165,7 @@ run_parity() {
 # All other tests that launch kernels on the device; those that only compile need none.
 run_kernels() {
   local files=(tests/ops -k triton --ignore-glob='*machine_code*')
-  files+=(--ignore=tests/ops/triton/test_{parity,edges,lists,parts,gates}.py)
+  files+=(--ignore=tests/ops/test_parity.py --ignore=tests/ops/triton/test_{lists,parts,gates}.py)
   [ "$DRY" = 0 ] || files=(tests/ops/triton/test_refused.py)
   run_tests kernels 75 "${files[@]}"
 }

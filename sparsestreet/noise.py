@@ -1,7 +1,6 @@
 """Measures how steady the machine is, by a fixed loop before and after what is timed."""
 
 import os
-import zlib
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -65,18 +64,3 @@ def noise_between(before: Calibration, after: Calibration) -> Noise:
     drift = after.milliseconds / before.milliseconds - 1
     quiet = max(before.spread, after.spread) < QUIET_SPREAD and abs(drift) < QUIET_DRIFT
     return Noise(before.spread, after.spread, drift, before.load_average, quiet)
-
-
-def named_seed(seed: int, name: str) -> int:
-    """Return the seed of the stream with this name."""
-    return seed + zlib.crc32(name.encode())
-
-
-def named_generator(seed: int, name: str) -> torch.Generator:
-    """Return the random stream of the part with this name; it does not depend on what other parts draw.
-
-    >>> one, again, other = (named_generator(0, name) for name in ("sky", "sky", "field"))
-    >>> one.initial_seed() == again.initial_seed(), one.initial_seed() == other.initial_seed()
-    (True, False)
-    """
-    return torch.Generator().manual_seed(named_seed(seed, name))

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "sparsestreet"
 MIN_LINES = 60
 MAX_LINES = 600
 ALLOWED = {
-    "modules below 60 lines": 12,
+    "modules below 60 lines": 13,
     "modules above 600 lines": 0,
     "docstrings that begin with a fragment": 76,
     "docstrings that begin in the third person": 30,

@@ -61,7 +61,7 @@ def light_warnings(light: Light) -> Iterator[str]:
     if light.stops >= MIN_STOPS:
         yield (
             f"{light.images} images have a mean gray level of {light.level:.0f} of 255, and a noise of "
-            f"{light.noise:.1f} levels: noise is a large part of them, and nothing simulates it"
+            f"{light.noise:.1f} levels: they are dark, and nothing simulates their noise"
         )
     if light.clipped >= MIN_CLIPPED:
         yield (

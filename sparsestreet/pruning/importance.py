@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from sparsestreet.noise import named_generator
 from sparsestreet.pruning.select import Keep, PruningRule, RenderContext, check_keep, contributions, keep_counts
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.scene.gaussians import Rows, Selection
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import Contribution, Frame
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.geometry.boxes import without_frames
-from sparsestreet.noise import named_generator
 from sparsestreet.phases import stage
 from sparsestreet.scene.effects import Effect
 from sparsestreet.scene.effects.effect import EffectPlan, PlannedEffect
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings

@@ -275,7 +275,9 @@ def test_everything_reaches_its_measurement(tmp_path, monkeypatch):
         replaced(name, answer)
     true = run_module.evaluate_frames
     monkeypatch.setattr(
-        run_module, "evaluate_frames", lambda *args: seen.setdefault("frames", []).append(args) or true(*args)
+        run_module,
+        "evaluate_frames",
+        lambda *args, **how: seen.setdefault("frames", []).append(args) or true(*args, **how),
     )
     lpips, absent = {}, {"lpips_alex": "none"}
     monkeypatch.setattr(run_module, "open_lpips", lambda device: seen.update(lpips=device) or (lpips, absent))
@@ -287,7 +289,7 @@ def test_everything_reaches_its_measurement(tmp_path, monkeypatch):
     ):  # fmt: skip
         (((one, some, options), given),) = seen[name]
         assert (one, [view.indices for view in some], options, given) == (scene, views, OPTIONS, how)
-    first, second = seen["frames"]
+    first, second, *_ = seen["frames"]  # then those of effect gains
     assert [frame.indices for frame in first[1]] == views
     assert [frame.indices for frame in second[1]] == [(4, 1)]
     assert (first[2], second[2]) == (OPTIONS, OPTIONS)

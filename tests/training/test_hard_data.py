@@ -86,7 +86,11 @@ CASES = {
         changed(other_world), [f"camera {name} sees hardly any return of the lidar" for name in "01"]
     ),
     "a covered camera": Case(
-        changed(covered), ["camera 1 shows a single gray level in 11 of 11 images, as if it were covered: leave it out"]
+        changed(covered),
+        [
+            "camera 1 shows a single gray level in 11 of 11 images, as if it were covered: leave it out",
+            "have a mean gray level of 50 of 255, and a noise of 0.1 levels",
+        ],
     ),
     "a track twice": Case(
         changed(lambda frame: frame, box("twin")), ["objects car and twin (Car) have one box in 12 frames: remove one"]

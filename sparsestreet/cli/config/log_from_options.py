@@ -19,10 +19,9 @@ from omegaconf import DictConfig, OmegaConf
 from sparsestreet.cli.config.compose import as_typed, composed, configuration
 from sparsestreet.cli.config.targets import made
 from sparsestreet.cli.config.validate import override_problem, unresolvable
-from sparsestreet.data.reader import UNREAD, FolderSignature
 
 if TYPE_CHECKING:
-    from sparsestreet.data.reader import LogReader
+    from sparsestreet.data.reader import FolderSignature, LogReader
 
 AUTO = "data=auto"
 _MORE = "docs/datasets/README.md says what is read"
@@ -64,6 +63,8 @@ def found_option(root: Path, searchpath: Sequence[str] = ()) -> tuple[str, Path]
     if known:
         told = " and ".join(f"data={name} ({path} is there)" for name, path in known.items())
         raise ValueError(f"{root} has the files of {told}: name the one that is meant")
+    from sparsestreet.data.reader import UNREAD  # with torch
+
     for unread in UNREAD:
         if path := unread.marks.found_in(root):
             raise ValueError(f"{root} is {unread.name}, as {path.name} tells, which is not read: {unread.remedy}")
@@ -84,7 +85,7 @@ def _root_of(arguments: Sequence[str]) -> Path:
 
 
 @cache
-def _marks_of_options(searchpath: tuple[str, ...]) -> dict[str, FolderSignature]:
+def _marks_of_options(searchpath: tuple[str, ...]) -> "dict[str, FolderSignature]":
     """Of every option with a root whose reader states its marks."""
     with configuration():
         loader = GlobalHydra.instance().config_loader()
@@ -102,12 +103,12 @@ def _reader_of(name: str, target: str) -> Any:
         raise ValueError(f"data={name} names {target}, which cannot be imported: {error}") from error
 
 
-def _known_as(root: Path, marks: Mapping[str, FolderSignature]) -> dict[str, Path]:
+def _known_as(root: Path, marks: "Mapping[str, FolderSignature]") -> dict[str, Path]:
     """Option -> the file that tells."""
     return {name: path for name, one in marks.items() if (path := one.found_in(root))}
 
 
-def _nearby(root: Path, marks: Mapping[str, FolderSignature]) -> tuple[Path, str] | None:
+def _nearby(root: Path, marks: "Mapping[str, FolderSignature]") -> tuple[Path, str] | None:
     """A folder that a reader knows, around a wrong one or in it, and the option."""
     inside = root.absolute()
     for above in inside.parents[:_ABOVE]:

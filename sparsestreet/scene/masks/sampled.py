@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.noise import named_seed
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
+from sparsestreet.scene.generators import named_seed
 from sparsestreet.scene.masks.mask import Mask, MaskScope
 from sparsestreet.scene.masks.static import COLUMN, lowered_threshold, straight_through
 

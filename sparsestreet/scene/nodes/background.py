@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sparsestreet.noise import named_generator
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.gaussians import lie_flat, neighbor_scales, outside_swept_boxes
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import Coverage, TrainingData, coverage

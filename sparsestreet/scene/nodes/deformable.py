@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from sparsestreet.geometry.cameras import distance_to_view
 from sparsestreet.geometry.quaternions import normalized
-from sparsestreet.noise import named_generator
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings

@@ -13,11 +13,11 @@ from torch import Tensor, nn
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import view_lag, without_frames
 from sparsestreet.geometry.trajectories import Trajectories, smoothed
-from sparsestreet.noise import named_generator
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
 from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.gaussians import Points, box_surface_points, lidar_in_boxes, neighbor_scales
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, usual_track_rates

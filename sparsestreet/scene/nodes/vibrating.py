@@ -9,10 +9,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from sparsestreet.noise import named_generator
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.density.vibrating import displacements, faded_logits, mean_velocities
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.background import BackgroundSettings

@@ -10,12 +10,12 @@ from lightning import Callback, Trainer
 from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
-from sparsestreet.noise import named_seed
 from sparsestreet.phases import phase
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.curves import CountChange
 from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.generators import named_seed
 from sparsestreet.scene.nodes.node import Node
 from sparsestreet.training.forecast import bytes_for_growth, bytes_of_row
 from sparsestreet.training.lightning import begins_step, callbacks_of, data_of, ends_step, ranks_of

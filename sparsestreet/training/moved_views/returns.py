@@ -15,7 +15,7 @@ from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.geometry.boxes import CarriedPoints, box_at, inside_box
 from sparsestreet.geometry.cameras import inverse, project, transform_points
-from sparsestreet.noise import named_generator
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.gaussians import at_most, outside_boxes, returns_in_box_frame
 from sparsestreet.types import Camera, Frame, Sweep, Track
 

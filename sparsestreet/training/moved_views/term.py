@@ -12,9 +12,9 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lidar import EdgeShift, edge_shift
 from sparsestreet.geometry.boxes import displacement, without_frames
 from sparsestreet.geometry.cameras import distance_to_view, moved, resized, transform_points
-from sparsestreet.noise import named_generator
 from sparsestreet.phases import stage
 from sparsestreet.scene.build import assign_tracks
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import NodeSettings, RigidSettings
 from sparsestreet.scene.rendering import SceneRendering, from_another_camera

@@ -109,7 +109,7 @@ def test_other_scenes_are_looked_for_beside_the_file(tmp_path, other):
         ("replace: {a: {scene: there, of: cow}}", "replace: a: in there: the scene has no object 'cow'"),
         ("{remove: [a], hide: {a: [0, 1]}}", "a is edited twice"),
         ("remove: [a", "is no YAML"),
-        (f"remove: [{'9' * 5000}]", r"is no YAML that can be read: Exceeds the limit"),
+        (f"remove: [{'9' * 5000}]", r"is no YAML: Exceeds the limit"),
     ],
 )
 def test_a_wrong_file_gets_one_sentence_that_names_it(text, said, tmp_path, other):

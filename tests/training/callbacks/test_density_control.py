@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from sparsestreet.noise import named_seed
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.gaussians import Rows
+from sparsestreet.scene.generators import named_seed
 from sparsestreet.training.callbacks import DensityControl
 from sparsestreet.training.schedule import Interval
 from tests.training.callbacks.refining import asked_at, every_ten, started

@@ -5,9 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.noise import named_generator
 from sparsestreet.scene.effects import LensSettings
 from sparsestreet.scene.effects.optics import Pinhole
+from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, from_another_camera, render
 from sparsestreet.scene.state import SceneState
