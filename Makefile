@@ -32,17 +32,8 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wild
 
 # One thread a process: tests are small, and threads that wait for each other cost more than they bring. Files in the order
 # of their names: trainings (tests/cli) come early, where files of few tests would come last and leave a process idle.
-# Three processes where there are four cores or more: the types take one.
-PROCESSES ?= $(shell test "$$(getconf _NPROCESSORS_ONLN)" -gt 3 && echo 3 || echo 2)
+PROCESSES ?= $(shell test "$$(getconf _NPROCESSORS_ONLN)" -gt 3 && echo 4 || echo 2)
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder
-
-# Types take 40 s of one core: the targets that take minutes check them beside the tests, which leave a core idle, and
-# show what is wrong behind them. Either one fails the target.
-define beside_types
-	@mkdir -p .cache; $(BIN)/pyright >.cache/types.txt & types=$$!; \
-	echo '$(1)'; $(1); tests=$$?; \
-	wait $$types; types=$$?; cat .cache/types.txt; exit $$((tests ? tests : types))
-endef
 
 quick: style ## the loop of daily work, under a minute: style and unit tests without trainings and Triton's interpreter
 	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'
@@ -51,11 +42,11 @@ elsewhere: $(VENV)/.ok ## the fast tests as on another processor, in another tim
 	ATEN_CPU_CAPABILITY=default PYTHONHASHSEED=7 TZ=Asia/Kolkata LC_ALL=C $(PYTEST) --ignore=tests/cli \
 	  -m 'not slow and not lengthy and not interpreted'
 
-test: style ## what a change must pass: lint and all tests but those marked slow
-	$(call beside_types,$(PYTEST) -m "not slow" --durations=20)
+test: style ## what a change must pass, beside make types: lint and all tests but those marked slow
+	$(PYTEST) -m "not slow" --durations=20
 
 test-all: style ## lint and all tests: every kernel for every architecture, every size of tiles
-	$(call beside_types,$(PYTEST) -m "not stress")
+	$(PYTEST) -m "not stress"
 
 stress: $(VENV)/.ok ## kills, damaged and hostile files, 20,000 steps, shared caches: seven minutes
 	$(PYTEST) -m stress --durations=20 tests/stress
