@@ -67,11 +67,19 @@ DRIVES = {
     "half of the people": Case("humanpose/smpl.pkl", cut, "must be a pickle of plain values"),
 }
 """Of a drive that is to be trained."""
+
+
+def torn(path: Path) -> None:
+    """Cut a YAML file and open a bracket: half of one may be whole, by chance."""
+    cut(path)
+    path.write_text(path.read_text(encoding="utf-8") + "\n{[", encoding="utf-8")
+
+
 EVALUATE, RENDER, EXPORT = ("evaluate", "{run}"), ("render", "{run}", "{out}/a.mp4"), ("export", "{run}", "{out}/a.ply")
 RUNS = {
     "half a description": (EVALUATE, Case("run.json", cut, "run.json: is not strict JSON")),
     "an empty configuration": (EVALUATE, Case(".hydra/config.yaml", empty, "its configuration lacks 'evaluation'")),
-    "half a configuration": (EVALUATE, Case(".hydra/config.yaml", cut, "/.hydra/config.yaml is ")),
+    "half a configuration": (EVALUATE, Case(".hydra/config.yaml", torn, "/.hydra/config.yaml is ")),
     "no word of its start": (EVALUATE, Case(".hydra/hydra.yaml", empty, "hydra.yaml is damaged")),
     "half a scene": (EVALUATE, Case("scene.safetensors", cut, "is no scene file or is damaged")),
     "an empty scene": (RENDER, Case("scene.safetensors", empty, "is no scene file or is damaged")),
