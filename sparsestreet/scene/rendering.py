@@ -17,20 +17,22 @@ from sparsestreet.scene.state import DEFAULT_OPTIONS, FINISHED, RenderOptions, S
 from sparsestreet.types import Gaussians, Rendering, View
 
 
-def light_of(stored: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """Linear light; 1 is white, and values outside of [0, 1] follow the same formula.
+def light_of(stored: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Return the linear light of an sRGB image; 1 is white, and values outside of [0, 1] have a light and a gradient.
 
-    >>> light_of(torch.tensor([0.0, 0.5, 1.0]))
-    tensor([0.0000, 0.2140, 1.0000])
+    >>> light_of(torch.tensor([[[0.0, 0.5, 1.0]]]))
+    tensor([[[0.0000, 0.2140, 1.0000]]])
     """
-    # The power of what takes the other branch would have no gradient.
-    return torch.where(stored <= 0.04045, stored / 12.92, ((stored.clamp(min=0.04045) + 0.055) / 1.055) ** 2.4)
+    from kornia.color import rgb_to_linear_rgb  # a quarter of a second, for motion blur alone
+
+    return rgb_to_linear_rgb(stored.movedim(2, 0)).movedim(0, 2)
 
 
-def stored_of(light: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
-    """The inverse of ``light_of``."""
-    power = 1.055 * light.clamp(min=0.0031308) ** (1 / 2.4) - 0.055
-    return torch.where(light <= 0.0031308, 12.92 * light, power)
+def stored_of(light: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
+    """Return the sRGB image of linear light, the inverse of ``light_of``."""
+    from kornia.color import linear_rgb_to_rgb
+
+    return linear_rgb_to_rgb(light.movedim(2, 0)).movedim(0, 2)
 
 
 NODE_COLORS = ((0.30, 0.60, 0.90), (0.98, 0.60, 0.15), (0.35, 0.80, 0.40), (0.90, 0.35, 0.60), (0.80, 0.75, 0.25))

@@ -139,13 +139,13 @@ def test_gradients_of_all_moments_come_together():
 
 
 def test_light_and_stored_values_undo_each_other():
-    values = torch.linspace(-0.2, 1.5, 200, dtype=torch.float64)[:, None].expand(-1, 3)
+    values = torch.linspace(-0.2, 1.5, 200, dtype=torch.float64)[:, None, None].expand(-1, 1, 3)
     torch.testing.assert_close(stored_of(light_of(values)), values)
-    inside = values[(values[:, 0] > 0.05)]
+    inside = values[values[:, 0, 0] > 0.05]
     np.testing.assert_allclose(light_of(inside).numpy(), srgb_light(inside), rtol=1e-12)
-    edge = torch.tensor([[0.0, -0.1, 0.04045]], requires_grad=True)
+    edge = torch.tensor([[[0.0, -0.1, 0.04045]]], requires_grad=True)
     stored_of(light_of(edge)).sum().backward()
-    torch.testing.assert_close(edge.grad, torch.ones(1, 3), rtol=0.02, atol=0)  # the standard's kink is 1 % wide
+    torch.testing.assert_close(edge.grad, torch.ones(1, 1, 3), rtol=0.02, atol=0)  # the standard's kink is 1 % wide
 
 
 def exposed_log(seconds: float) -> DrivingLog:
