@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from sparsestreet.data.hood import MIN_DRIVE
+from sparsestreet.data.log import DrivingLog
 from sparsestreet.pictures.images import Marked
 from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
 from sparsestreet.scene.initialize.training_data import TrainingData
@@ -25,6 +26,17 @@ class ReportedSettings(EffectSettings):
         raise ValueError(f"no scene file holds what is only reported ({type(self).__name__}): train the scene again")
 
 
+def _unknown(log: DrivingLog, min_share: float, what: str) -> Finding:
+    """Return what is found in a log whose cameras stand: nothing that can be told from the street."""
+    return Finding(
+        called_for=False,
+        reason=f"no camera of {log.name} moves by {MIN_DRIVE:g} m, so what never changes may be the street",
+        unit="of an image",
+        threshold=min_share,
+        missing=f"read a longer drive, or give masks of {what} (data.log.masks)",
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class HoodSettings(EffectSettings):
     """Called for where rows at the bottom of a camera's images never change.
@@ -39,13 +51,7 @@ class HoodSettings(EffectSettings):
     def detect(self, data: TrainingData) -> Finding:
         hoods, log = data.log.hoods, data.log
         if not hoods:
-            return Finding(
-                called_for=False,
-                reason=f"no camera of {log.name} moves by {MIN_DRIVE:g} m, so what never changes may be the street",
-                unit="of an image",
-                threshold=self.min_share,
-                missing="read a longer drive, or give masks of the car (data.log.masks)",
-            )
+            return _unknown(log, self.min_share, "the car")
         camera, largest = max(hoods.items(), key=lambda item: item[1].share)
         seen = [camera for camera, hood in hoods.items() if hood.share >= self.min_share]
         return Finding(
@@ -92,13 +98,7 @@ class DirtSettings(ReportedSettings):
     def detect(self, data: TrainingData) -> Finding:
         spots, log = data.log.dirt, data.log
         if not spots:
-            return Finding(
-                called_for=False,
-                reason=f"no camera of {log.name} moves by {MIN_DRIVE:g} m, so what never changes may be the street",
-                unit="of an image",
-                threshold=self.min_share,
-                missing="read a longer drive, or give masks of the spots (data.log.masks)",
-            )
+            return _unknown(log, self.min_share, "the spots")
         shares = {camera: float(each.mask.float().mean()) for camera, each in spots.items()}
         camera = max(shares, key=shares.__getitem__)
         count = sum(share >= self.min_share for share in shares.values())
