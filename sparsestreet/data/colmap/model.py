@@ -191,7 +191,6 @@ def binary_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
     return positions, colors
 
 
-_REMEDY_TEXT = "export the model again"
 _MAX_SHOWN = 60
 """Words."""
 _MAX_LINE = 32_000_000
@@ -284,11 +283,11 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                     raise _broken(path, number, f"it has more than {_MAX_LINE:,} letters")
                 yield number, line
     except UnicodeDecodeError as error:
-        raise fault(path, f"the file is no text ({error})", _REMEDY_TEXT) from error
+        raise fault(path, f"the file is no text ({error})", _REMEDY) from error
 
 
 def _broken(path: Path, line: int, message: str) -> LogError:
-    return fault(path, f"line {line}: {message}", _REMEDY_TEXT)
+    return fault(path, f"line {line}: {message}", _REMEDY)
 
 
 _PLACES = (".", "sparse/0", "sparse", "colmap/sparse/0")

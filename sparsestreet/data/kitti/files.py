@@ -110,7 +110,6 @@ class Drive:
     folder: Path
     cameras: tuple[str, ...]
     frames: range
-    num_on_disk: int
 
     @property
     def name(self) -> str:
@@ -159,7 +158,7 @@ def find_drive(
     if not images:
         raise fault(folder / chosen[0] / "data", "the folder holds no images", "unpack the archive again")
     frames = frame_window(1 + max(images), first_frame, last_frame, folder)
-    return Drive(folder, chosen, frames, 1 + max(images))
+    return Drive(folder, chosen, frames)
 
 
 def _folder(root: Path, name: str | None) -> Path:
