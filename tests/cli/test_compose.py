@@ -42,6 +42,7 @@ from tests.typed import there
         (["image_points=null"], "choose one of none, sift"),
         (["methd=3dgs"], "did you mean 'method'? Its options are 3dgs, deformgs, omnire, pvg, streetgs"),
         (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of one_schedule"),
+        (["experiment=rule"], "experiment/rule holds several options: choose one of importance, lightgaussian"),
         (["density=gradient"], "did you mean density@node.background.density or density@node.rigid.density? Its opt"),
         (["render=fast"], "set one of render.backend, render.preset, render.settings"),
         (["trainer.max_step=5"], "did you mean 'schedule.max_steps'?"),  # which that one follows

@@ -27,6 +27,8 @@ CONF = PACKAGE / "conf" if (PACKAGE / "conf").is_dir() else PACKAGE.parent / "co
 GLOBAL = "# @package _global_"
 """First line of a file whose keys begin at the root."""
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_OPTIONS = re.compile(r"^# Options of ", re.MULTILINE)
+"""A line of a file that holds several options, by their names."""
 _NAMED = ("effects", "loss", "callback", "source")
 """Groups of which several options are chosen at once: each stands below its own name."""
 
@@ -34,20 +36,22 @@ _NAMED = ("effects", "loss", "callback", "source")
 def config_files() -> Iterator[tuple[str, bool, Any]]:
     """Yield the path below conf/ of each option, without its ending, whether its keys are global, and its tree."""
     for path in sorted(CONF.rglob("*.yaml")):
-        place = path.relative_to(CONF).with_suffix("")
-        if place.parts[0] != "options":
-            text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
+        if not _OPTIONS.search(text):
+            place = path.relative_to(CONF).with_suffix("")
             yield place.as_posix(), text.startswith(GLOBAL), yaml.load(text, LOADER) or {}
     yield from _short_options()
 
 
 def _short_options() -> Iterator[tuple[str, bool, Any]]:
-    """Yield the same of those in conf/options: ``options/experiment.yaml`` holds ``experiment/claim/node_aware``."""
-    for path in sorted((CONF / "options").glob("*.yaml")):
+    """Yield the same of files that hold several: ``experiment/claim.yaml`` those of ``experiment=claim/NAME``."""
+    for path in sorted([*CONF.glob("options/*.yaml"), *CONF.glob("experiment/*.yaml")]):
         text = path.read_text(encoding="utf-8")
+        if not _OPTIONS.search(text):
+            continue
+        group = path.relative_to(CONF).with_suffix("").as_posix().removeprefix("options/")
         for name, option in (yaml.load(text, LOADER) or {}).items():
-            tree = {name: option} if path.stem in _NAMED else option or {}
-            yield f"{path.stem}/{name}", text.startswith(GLOBAL), tree
+            yield f"{group}/{name}", text.startswith(GLOBAL), {name: option} if group in _NAMED else option or {}
 
 
 @cache
@@ -63,11 +67,11 @@ def option_tree(group: str, name: str) -> Any:
 
 
 def register_options() -> None:
-    """Tell Hydra of the options in conf/options, which reads files of single options itself."""
+    """Tell Hydra of the options that share a file; it reads files of single options itself."""
     for place, anywhere, tree in _short_options():
         group, _, name = place.rpartition("/")
         package = "_global_" if anywhere else None
-        ConfigStore.instance().store(name=name, node=tree, group=group, package=package, provider="conf/options")
+        ConfigStore.instance().store(name=name, node=tree, group=group, package=package, provider="conf")
 
 
 register_options()

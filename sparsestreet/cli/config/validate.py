@@ -149,6 +149,8 @@ def _sparsify_with_masks() -> str:
 def _explain(reason: str, overrides: list[str]) -> str:
     """Hydra's reason (its first line names what is wrong) with the whole key and the key or option that was meant."""
     if (place := re.match(r"In '([^']+)': (.+)", reason, re.S)) and place[1] != "train":
+        if options_of(place[1]):
+            return f"{place[1]} holds several options: choose one of {', '.join(options_of(place[1]))}"
         return f"{place[1]}.yaml: {_explain_file(place[2], overrides)}"
     said, given = reason.splitlines()[0], [text.partition("=")[0].lstrip("+~") for text in overrides]
     if "Got NoneType" in said:
