@@ -69,6 +69,30 @@ def test_what_breaks_a_rule_of_the_house_only_becomes_less():
     assert {rule: count for rule, count in found.items() if count > ALLOWED[rule]} == {}
 
 
+def unknown_names(room: Path) -> list[str]:
+    """Names in the docstring of a room's __init__ that are neither its modules nor defined or imported below it."""
+    text = (room / "__init__.py").read_text()
+    below = " ".join(path.read_text() for path in room.rglob("*.py") if path.parent != room or path.stem != "__init__")
+    known = {path.stem for path in room.iterdir()} | set(re.findall(r"(?:def|class) (\w+)", below))
+    doc, code = ast.get_docstring(ast.parse(text)) or "", text.split('"""')[-1]
+    known |= set(re.findall(r"\w+", code))
+    names = (
+        name.rpartition(".")[2] for name in re.findall(r"``([a-z][a-z0-9_.]*)``", doc) if not name.endswith(".json")
+    )
+    return [name for name in names if name not in known]
+
+
+def test_a_room_names_no_module_that_is_gone():
+    rooms = sorted(path.parent for path in (ROOT / "sparsestreet").rglob("__init__.py"))
+    assert {room.name: gone for room in rooms if (gone := unknown_names(room))} == {}
+
+
+def test_a_room_that_names_what_is_gone_is_found(tmp_path):
+    (tmp_path / "__init__.py").write_text('"""``run`` trains, ``identity`` names."""\n')
+    (tmp_path / "run.py").write_text("def train(): ...\n")
+    assert unknown_names(tmp_path) == ["identity"]
+
+
 def test_a_slip_is_counted():
     tree = ast.parse('"""Of a sweep."""\nMOST_ROWS = 3\nMAX_ROWS = 4\n\ndef f():\n    """Returns it."""\n')
     assert constants(tree) == ["MOST_ROWS", "MAX_ROWS"]

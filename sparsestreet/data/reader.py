@@ -138,7 +138,7 @@ class LogReader(ABC):
         return LogFiles(recorded=[path for path in self.folder.rglob("*") if path.is_file()])
 
     def data_hash(self) -> str:
-        """12 hexadecimal digits that are equal for the same log, wherever it lies (``fingerprint.hash_files``)."""
+        """12 hexadecimal digits that are equal for the same log, wherever it lies (``hash_files``)."""
         return hash_files(self.folder, self.files())
 
 

@@ -37,7 +37,7 @@ class Undistortion:
     ) -> "Undistortion":
         """Where the lens shows what each pixel center of a pinhole sees.
 
-        For Brown-Conrady and the same intrinsics it is K distort(K^-1 p) (``geometry.distortion`` has the formula).
+        For Brown-Conrady and the same intrinsics it is K distort(K^-1 p) (``geometry.lenses`` has the formula).
         OpenCV's ``undistort`` is the same for a principal point that is counted from the first pixel's center.
 
         Args:

@@ -73,7 +73,7 @@ class Timing:
     repeats: int = 50
     """Renders of each of its clocks."""
     rounds: int = 25
-    """Rounds of ``node_costs.measure_scene_costs``."""
+    """Rounds of ``measure_scene_costs``."""
 
     def __post_init__(self) -> None:
         if min(self.warmup, self.repeats, self.rounds) < 1:

@@ -1,0 +1,1 @@
+"""Formulas of space: ``quaternions``, ``cameras``, ``lenses``, ``boxes``, ``trajectories`` and the ``skeleton``."""

@@ -118,7 +118,7 @@ def project(
 ) -> tuple[Float[Tensor, "n 2"], Float[Tensor, " n"], Bool[Tensor, " n"]]:
     """Return pixel coordinates, depths along the optical axis (meters), and whether each world point is in the image.
 
-    A point past the fold of a lens (``geometry.distortion``) is not in the image. The points may be on any device; the
+    A point past the fold of a lens (``geometry.lenses``) is not in the image. The points may be on any device; the
     camera is on the host.
 
     >>> intrinsics = torch.tensor([[10.0, 0.0, 2.0], [0.0, 10.0, 2.0], [0.0, 0.0, 1.0]])

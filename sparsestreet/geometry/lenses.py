@@ -280,7 +280,7 @@ class _Focal(Lens):
 
 @dataclass(frozen=True, kw_only=True)
 class BrownConrady(_Focal):
-    """OpenCV's five numbers (``geometry.distortion`` has the formula, and how it goes on past its fold); zeros are a
+    """OpenCV's five numbers (``geometry.lenses`` has the formula, and how it goes on past its fold); zeros are a
     pinhole. Its images and those of ``Rational`` end 90 degrees from the axis."""
 
     k1: float = 0.0

@@ -1,8 +1,8 @@
 """Scores Gaussians over all training views and selects which to keep.
 
-``rule`` is the interface of the rules, ``importance`` the paper's score, ``rules`` the paper's rule and ours (leave
-one out). ``published`` has the rules of other papers, ``controls`` those that look at no image. ``counts`` keep a given
-number of each node, ``select`` drops rows by scores but respects the ``floors`` of a node and its instances.
+``select`` has the interface of the rules, and drops rows by scores but respects the floors of a node and its
+instances. ``rules`` has the paper's rule and ours (leave one out). ``importance`` has the paper's score, the rules of
+other papers, and controls that look at no image.
 """
 
 from sparsestreet.pruning.importance import (

@@ -153,8 +153,8 @@ def given_keys(commands: Iterable[str]) -> set[str]:
 def chosen_options(command: str) -> dict[str, str]:
     """Return the choices of groups that a command gives: the group, with its place where it has one -> the option.
 
-    >>> chosen_options("sparsestreet train -m pruning@callback.pruning.rule=volume render=fast seed=0 a.b=1")
-    {'pruning@callback.pruning.rule': 'volume', 'render': 'fast', 'seed': '0'}
+    >>> chosen_options("sparsestreet train -m pruning@callback.pruning.rule=opacity render=fast seed=0 a.b=1")
+    {'pruning@callback.pruning.rule': 'opacity', 'render': 'fast', 'seed': '0'}
     """
     words = (word.partition("=") for word in _words(command))
     given = ((key.lstrip("+"), equals, value) for key, equals, value in words)

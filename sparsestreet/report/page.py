@@ -35,7 +35,7 @@ class Page:
     figures: Sequence[tuple[str, str]]
     """Caption and SVG."""
     pictures: str | None
-    """The JSON of ``comparison.comparison_data``."""
+    """The JSON of ``comparison_data``."""
     records: Sequence[RunRecord]
     failures: Sequence[tuple[Path, FailedRun]]
     summary_line: Sequence[str] = ()

@@ -44,7 +44,7 @@ class ServedScene:
 
 @dataclass(frozen=True)
 class RigOptions:
-    """What a user says of the vehicle (``rig.rig_of``)."""
+    """What a user says of the vehicle (``rig_of``)."""
 
     mount: tuple[float, ...] | None = None
     names: tuple[str, ...] | None = None

@@ -79,7 +79,7 @@ def train(
     checkpoints_before: Sequence[float] = (),
     stages: StageRecorder | None = None,
 ) -> RunSummary | None:
-    """Train a scene and evaluate it; what a run leaves (README) lies in ``out``.
+    """Train a scene and evaluate it; what a run leaves lies in ``out`` (docs/architecture.md lists it).
 
     Of several processes (``training/parallel``) each one trains and measures its share of the images; the first alone
     writes, times frames and returns a summary.

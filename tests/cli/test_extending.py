@@ -132,6 +132,12 @@ def test_a_density_strategy():
         assert len(plan.source) == after  # radius 1e6: every row is small, so that each wanted one is cloned
 
 
+def test_a_method_with_a_sparsification():
+    recipe = recipe_of(composed("method=no_lidar", "sparsify=masks"))
+    assert set(recipe.nodes) == {"background", "rigid"}
+    assert set(recipe.losses) == {"photometric", "sky", "mask_sparsity"}
+
+
 def test_a_mask():
     settings = recipe_of(composed("sparsify=masks", PROBIT)).nodes["background"]
     scope = MaskScope.whole([0.0, 1.0], torch.zeros(3), radius=1.0)

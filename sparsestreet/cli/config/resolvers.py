@@ -23,7 +23,7 @@ PRESSED_STEPS = 2000
 
 
 def concat(*lists: Iterable[Any]) -> ListConfig:
-    """Of conf/assignment: all lists as one."""
+    """Of conf/options/assignment.yaml: all lists as one."""
     return ListConfig([entry for entries in lists for entry in entries])  # ``--resolve`` takes no list of Python's
 
 
@@ -170,8 +170,8 @@ _TOLD = ("seed", "method", "sparsify", "assignment", "preset", "name", "out", "f
 def swept(overrides: Iterable[str], fixed: Iterable[str]) -> str:
     """Of conf/train.yaml: the options of a job that a sweep varies, for the name of its folder.
 
-    >>> swept(["seed=1", "pruning@callback.pruning.rule=volume", "a.keep=[0.5]", "a.b=3"], ["a.b"])
-    '_pruning=volume_keep=0.5'
+    >>> swept(["seed=1", "pruning@callback.pruning.rule=opacity", "a.keep=[0.5]", "a.b=3"], ["a.b"])
+    '_pruning=opacity_keep=0.5'
     """
     words = ""
     for text in overrides:

@@ -29,7 +29,7 @@ def step_rows_(
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """``visible_adam.adam_step_`` on contiguous float32 tensors; ``size`` and ``root`` are those of its AdamStep."""
+    """``adam_step_`` on contiguous float32 tensors; ``size`` and ``root`` are those of its AdamStep."""
     numbers = parameter.numel()
     if not numbers:
         return

@@ -119,7 +119,7 @@ def curvature(view, x, y):
 
 @jit
 def within_fold(view, mean):
-    """Whether the lens sees the point (geometry/distortion.py says where its range ends)."""
+    """Whether the lens sees the point (geometry/lenses.py says where its range ends)."""
     x, y = mean[0] / mean[2], mean[1] / mean[2]
     return x * x + y * y <= tl.load(view + FOLD)
 

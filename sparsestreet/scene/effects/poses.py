@@ -66,7 +66,7 @@ class RecordedPoses:
         return _mean(corrections, around) + self._shares(corrections) * beside
 
     def to_smooth_paths(self) -> Float64[Tensor, "n 6"]:
-        """The corrections that move each image to a smooth path of its camera (``geometry.smooth_paths``)."""
+        """The corrections that move each image to a smooth path of its camera (``geometry.trajectories``)."""
         found = torch.zeros(len(self.indices), 6, dtype=torch.float64)
         for places in self._by_camera.values():
             times = torch.tensor([[self.times[place] for place in places]])
@@ -368,10 +368,10 @@ class BoxPosesSettings(EffectSettings):
     """
 
     threshold: float = 2.0
-    """Centimeters, standard deviation of a corner about its path (``evidence.boxes``)."""
+    """Centimeters, standard deviation of a corner about its path (``evidence.poses``)."""
 
     smooth: bool = True
-    """Corrections start where boxes would lie on smooth paths (``geometry.smooth_paths``); false: at zero."""
+    """Corrections start where boxes would lie on smooth paths (``geometry.trajectories``); false: at zero."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

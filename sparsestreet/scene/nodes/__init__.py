@@ -1,9 +1,9 @@
 """The nodes of a scene. Each node class is one module with its settings, its initialization and its interface.
 
 ``node`` is the interface shared by all. Three classes hold a whole street: ``background`` stands still, Gaussians of
-``vibrating`` swing and fade, and a ``network`` deforms those of ``field``. Three classes hold objects and move them
-along their tracks (``tracked``). ``rigid`` keeps their shape, ``deformable`` changes it with a network, and ``smpl``
-moves people by their skeletons.
+``vibrating`` swing and fade, and a network deforms those of a field (in ``deformable``). Three classes hold objects and
+move them along their tracks (``tracked``, with the rigid node, which keeps their shape). ``deformable`` changes it with
+a network, and ``smpl`` moves people by their skeletons.
 """
 
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings

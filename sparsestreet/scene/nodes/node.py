@@ -146,7 +146,7 @@ class NodeSettings(ABC):
     """Class names of the log whose tracks the node takes."""
     min_displacement: float | None = None
     """Meters; tracks whose boxes are nowhere farther apart than this, or than their noise explains, are left to the
-    static nodes (``geometry.displacement``). None: it is not asked."""
+    static nodes (``geometry.boxes``). None: it is not asked."""
     min_path_length: float = 0.0
     """Meters; so are tracks whose steps from box to box, noise included, add up to no more (DriveStudio's rule)."""
     has_body_pose: bool | None = None
@@ -172,11 +172,11 @@ class NodeSettings(ABC):
     prunable: bool = True
     """Whether pruning rules may remove Gaussians of this node."""
     sharp_shape: float = 0.0
-    """Weight of the term against needles (see ``regularizers.sharp_shape``); 0: the term is not computed."""
+    """Weight of the term against needles (see ``sharp_shape``); 0: the term is not computed."""
     max_axis_ratio: float = 10.0
     """Ratio of a Gaussian's longest to its shortest axis above which that term counts."""
     sharp_shape_form: Literal["log", "ratio"] = "log"
-    """``ratio``: DriveStudio's term, linear in the ratio (see ``regularizers.sharp_shape_ratio``)."""
+    """``ratio``: DriveStudio's term, linear in the ratio (see ``sharp_shape_ratio``)."""
     sharp_shape_every: int = 1
     """Steps from one that has the term to the next."""
     learning_rates: Rates = field(default_factory=usual_rates)

@@ -53,7 +53,7 @@ class SmplSettings(TrackedSettings):
     scale_weight: float = 0.05
     """Weight of the mean squared longest axis, square meters."""
     volume_weight: float = 0.0
-    """Weight of ``regularizers.excess_volume`` above ``volume_quantile`` (DriveStudio's scaling_reg); 0: none."""
+    """Weight of ``node.excess_volume`` above ``volume_quantile`` (DriveStudio's scaling_reg); 0: none."""
     volume_quantile: float = 0.99
     volume_from: float = 0.2
     """Fraction of the run at which that term starts."""

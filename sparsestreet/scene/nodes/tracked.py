@@ -50,7 +50,7 @@ class TrackedSettings(NodeSettings):
     """Frames' worth of time; within its span, an object is present up to this far from a training annotation."""
     learning_rates: Rates = field(default_factory=usual_track_rates)
     temporal_smooth: float = 0.0
-    """Weight of the term that keeps learned tracks smooth (see ``regularizers.temporal_smoothness``); 0: the term is
+    """Weight of the term that keeps learned tracks smooth (see ``node.temporal_smoothness``); 0: the term is
     not computed."""
     temporal_smooth_of: Literal["all", "frame"] = "all"
     """``all``: the mean over all frames and distances at every step; ``frame``: that of the step's frame and one drawn
@@ -238,7 +238,7 @@ class Tracked(Node):
             self.register_buffer(name, values)
 
     def smooth_boxes(self) -> None:
-        """Start the boxes' corrections where they make each object's path smooth (``geometry.smooth_paths``)."""
+        """Start the boxes' corrections where they make each object's path smooth (``geometry.trajectories``)."""
         with torch.no_grad():
             rotations, translations = smoothed(self.keyframes)
             self.rotation_deltas.copy_(rotations)

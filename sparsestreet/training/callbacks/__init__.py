@@ -1,9 +1,8 @@
-"""Callbacks know WHEN; what they apply is decided by pure functions in scene/density, scene/masks and pruning.
+"""Callbacks know when; pure functions in scene/density, scene/masks and pruning decide what they apply.
 
-They act in the order in which they are configured: ``density_control``, ``mask_training``, ``pruning``, all
-through ``resizing``. ``row_ledger``, ``phase_times``, ``held_out_curve`` and ``progress`` look on, ``clock`` and
-``stage_times`` count seconds, ``pace`` foretells them;
-``checkpoints``, ``run_files`` and ``graceful_stop`` see to what a run leaves, also one that is interrupted.
+``density_control`` adds, removes and resets rows, and has ``resize_rows``, through which every change goes.
+``sparsify`` trains masks and prunes. ``times`` counts seconds and rows and takes looks at held-out views, ``progress``
+shows the bar and foretells the pace. ``files`` writes checkpoints and a run's files, and ends a run after a signal.
 """
 
 from sparsestreet.training.callbacks.density_control import DensityControl

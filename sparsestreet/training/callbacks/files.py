@@ -1,5 +1,6 @@
-"""Signals end training after the step that is under way and its validation, so that it can go on exactly there.
+"""Files of a run (checkpoints, the newest one, what is kept), and the signals that end a run in good order.
 
+Signals end training after the step that is under way and its validation, so that it can go on exactly there:
 Ctrl-C and SIGTERM, a terminal that closes (SIGHUP), and what clusters send before they take a machine back (SIGUSR1,
 SIGUSR2).
 """

@@ -1,4 +1,4 @@
-// Where boxes are at a time: their keyframes with learned corrections, interpolated (geometry/trajectory.py).
+// Where boxes are at a time: their keyframes with learned corrections, interpolated (geometry/trajectories.py).
 #pragma once
 #include <algorithm>
 
