@@ -15,7 +15,7 @@ from sparsestreet.records.run import EffectDecision
 from sparsestreet.records.summary import PRESETS
 from sparsestreet.report.collect import TRUTH, UNIT, by_unit, mean_over_scenes, shifts_of
 from sparsestreet.report.tables import ABSENT, BUSY, Cell, Grid, busy_words, number_cell
-from sparsestreet.report.tradeoffs import difference_cell, interval_over_scenes
+from sparsestreet.report.tradeoffs import difference_cell, spread_over_scenes
 from sparsestreet.report.variants import Unit, Variant, busy_variants, plain_of
 
 _CLOCK_OF = {"ms/frame": "frames", "train s": "training"} | dict.fromkeys(("seconds", "ms of a step"), "training")
@@ -331,9 +331,9 @@ def _preset_rows(
         cells = [Cell(title, runs=runs), Cell(name, runs=runs), Cell(str(n), runs=runs)]
         for metric in (protocol.psnr, protocol.human[0], protocol.vehicle[0]):
             ours, theirs = by_unit(found, metric), by_unit(trained, metric)
-            interval = None if found.equals(trained) else interval_over_scenes((ours - theirs).dropna())
+            gain = None if found.equals(trained) else spread_over_scenes((ours - theirs).dropna())
             cells.append(number_cell(mean_over_scenes(ours), "{:.2f}", runs))
-            cells.append(difference_cell(interval, "{:+.2f}", n, runs))
+            cells.append(difference_cell(gain, "{:+.2f}", n, runs))
         for _, heading, form in _COSTS:
             mark = _busy_renders(renders) if heading == "ms/frame" else ""
             cells.append(number_cell(mean_over_scenes(by_unit(found, heading)), form, runs, mark))
