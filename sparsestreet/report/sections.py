@@ -38,12 +38,6 @@ def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) ->
     ]
 
 
-def camera_notes(variants: Sequence[Repeats]) -> list[str]:
-    """Return the notes of a table by camera. All other notes stand below the table that precedes it."""
-    runs = [run for variant in variants for run in variant.runs]
-    return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
-
-
 def _general(runs: Sequence[RunSummary], over_scenes: bool, protocol: Protocol) -> list[str]:
     alone = "n=1 has no spread and proves nothing below the noise of runs"
     mean = (
@@ -416,7 +410,9 @@ def _sections(
     cameras = camera_quantities(group.runs)
     if not cameras:
         return [whole]
-    return [whole, section(f"PSNR by camera, {title}", True, cameras, camera_notes(ordered))]
+    # All other notes stand below the table that precedes it.
+    said = [f"PSNR in dB of {_views(group.runs)}, the mean over the images of each camera; the rest as above"]
+    return [whole, section(f"PSNR by camera, {title}", True, cameras, said)]
 
 
 def _variant_row(variant: Repeats, columns: Sequence[Quantity], over_scenes: bool) -> Row:

@@ -17,6 +17,7 @@ from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.runs.folder import check_resumed, resumed_overrides
 from sparsestreet.records.costs import COSTS
 from sparsestreet.training.callbacks import RowLedger
+from tests.cli.configurations import left_run
 from tests.cli.conftest import ALL_STAGES, TINY_RIGID
 
 
@@ -145,20 +146,8 @@ def test_what_may_change_when_a_run_goes_on(tmp_path, change, refused):
         check_resumed(config | change, tmp_path)
 
 
-def small_run(folder: Path, *overrides: str) -> Path:
-    """What is asked of a run that goes on: its words and its configuration."""
-    (folder / ".hydra").mkdir(parents=True)
-    (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "last.ckpt").touch()
-    OmegaConf.save(list(overrides), folder / ".hydra" / "overrides.yaml")
-    OmegaConf.save(
-        {"seed": 3, "a": {"b": 1}, "out": "x", "trainer": {"precision": 16}}, folder / ".hydra" / "config.yaml"
-    )
-    return folder
-
-
 def test_a_run_goes_on_with_its_own_words_then_those_that_are_given(tmp_path):
-    run = small_run(tmp_path / "run", "seed=3", "out=old", "resume=null", "a.b=1")
+    run = left_run(tmp_path / "run", "seed=3", "out=old", "resume=null", "a.b=1", config={"seed": 3, "a": {"b": 1}})
     own = ["seed=3", "a.b=1"]
     assert resumed_overrides([f"resume={run}", "c=2"]) == [*own, f"resume={run}", "c=2", f"out={run}"]
     checkpoint = run / "checkpoints" / "last.ckpt"
