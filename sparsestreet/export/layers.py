@@ -4,7 +4,7 @@ import colorsys
 import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -100,9 +100,6 @@ def enlarged(values: UInt16[np.ndarray, "h w"], side: int) -> UInt16[np.ndarray,
     return np.where(found > MAX_MILLIMETERS, 0, found).astype(np.uint16)
 
 
-LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
-"""Those that are of the scene; ``lidar`` is of the log, ``seen`` of its images."""
-
 Values = Shaped[np.ndarray, "_h _w *_c"]
 """rgb uint8 [h, w, 3]; depth and lidar uint16, millimeters; alpha uint8; ids of nodes uint8, of instances uint16;
 seen uint8, images."""
@@ -117,28 +114,6 @@ _ENOUGH_IMAGES = 32
 """Images that have seen enough: the lightest color in a picture of ``seen``."""
 _MAX_IMAGES = 255
 _FIRST_HARMONIC = 0.28209479177387814
-
-
-@dataclass(frozen=True)
-class Instance:
-    """A line of the table of objects."""
-
-    id: int
-    name: str
-    class_name: str
-    node: str
-
-
-def instance_table(stored: StoredScene) -> list[Instance]:
-    """Return all objects of a scene; their ids start at 1, in the order of nodes and of their tracks."""
-    found: list[Instance] = []
-    for node_name, node in stored.scene.nodes.items():
-        objects = node.instances()
-        if objects is not None:
-            classes = objects.classes or ("",) * len(objects.names)
-            for name, kind in zip(objects.names, classes, strict=True):
-                found.append(Instance(len(found) + 1, name, kind, node_name))
-    return found
 
 
 @torch.no_grad()
@@ -250,14 +225,18 @@ def write_layers(
 
 
 def tables(stored: StoredScene, layers: Sequence[str]) -> Mapping[str, Any]:
-    """Return what ids mean, for the layers that have some."""
+    """Return what ids mean, for the layers that have some; those of objects are in the order of nodes and tracks."""
     found: dict[str, Any] = {}
     if "nodes" in layers:
         found["nodes"] = {str(number): name for number, name in enumerate(stored.scene.nodes, start=1)}
     if "instances" in layers:
-        found["instances"] = {
-            str(one.id): {"name": one.name, "class": one.class_name, "node": one.node} for one in instance_table(stored)
-        }
+        lines = [
+            {"name": name, "class": kind, "node": node_name}
+            for node_name, node in stored.scene.nodes.items()
+            if (objects := node.instances()) is not None
+            for name, kind in zip(objects.names, objects.classes or ("",) * len(objects.names), strict=True)
+        ]
+        found["instances"] = {str(number): line for number, line in enumerate(lines, start=1)}
     return found
 
 

@@ -12,7 +12,6 @@ import struct
 import subprocess
 import tempfile
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -187,20 +186,14 @@ class Checked:
         return self.bytes / max(self.gaussians, 1)
 
 
-def check_file(
-    path: Path,
-    written: Gaussians,
-    camera: Camera | None,
-    own_reader: Callable[[Path], Gaussians],
-    settings: SplatSettings,
-) -> Checked:
+def check_file(path: Path, written: Gaussians, camera: Camera | None, settings: SplatSettings) -> Checked:
     """Read a file by another program where it is installed, else by our own reader, and render both.
 
     ``written`` has the axes of viewers, ``camera`` too. Raises ValueError where the file cannot be read or has another
     number of Gaussians.
     """
     program = shutil.which(PROGRAM)
-    found = own_reader(path) if program is None else _read_by(program, path)
+    found = read_spz(path) if program is None else _read_by(program, path)
     if len(found) != len(written):
         raise ValueError(f"{path} has {len(found)} Gaussians for {len(written)} that were written: export it again")
     quality = None if camera is None else _psnr(found, written, camera, settings)

@@ -5,11 +5,11 @@ Training and evaluation each write their own part and keep the other's.
 
 import statistics
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sparsestreet.records.file import CsvFile, JsonFile
+from sparsestreet.records.file import JsonFile, table_of
 from sparsestreet.records.run import Noise
 from sparsestreet.records.strict_json import version
 
@@ -23,18 +23,7 @@ class StepPhase:
     milliseconds: float
 
 
-def _cells(part: StepPhase) -> Sequence[object]:
-    return part.step, part.phase, f"{part.milliseconds:.4f}"
-
-
-def _part_step_phases(cells: Sequence[str]) -> StepPhase:
-    step, phase, milliseconds = cells
-    return StepPhase(int(step), phase, float(milliseconds))
-
-
-STEP_PHASES = CsvFile(
-    "records/phases.csv", tuple(field.name for field in fields(StepPhase)), _cells, _part_step_phases, "train the run"
-)
+STEP_PHASES = table_of("records/phases.csv", StepPhase, "train the run", milliseconds=".4f")
 
 
 FORMAT = 1

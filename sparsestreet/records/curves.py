@@ -1,10 +1,10 @@
 """What changes over the steps of training: counts of Gaussians, a probe of held-out views, and what was logged."""
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
-from sparsestreet.records.file import CsvFile, RunFile, csv_lines, csv_text
+from sparsestreet.records.file import RunFile, csv_lines, csv_text, table_of
 from sparsestreet.records.strict_json import write_atomically
 
 MASK, PRUNING = "mask", "pruning"
@@ -23,18 +23,7 @@ class CountChange:
     """A word or two: "start", "densify", "cull", ``MASK``, ``PRUNING`` ..."""
 
 
-def _change(cells: Sequence[str]) -> CountChange:
-    step, node, before, after, reason = cells
-    return CountChange(int(step), node, int(before), int(after), reason)
-
-
-LEDGER = CsvFile(
-    "records/counts.csv",
-    tuple(field.name for field in fields(CountChange)),
-    lambda change: astuple(change),  # as it stands, astuple has two types
-    _change,
-    "train the run",
-)
+LEDGER = table_of("records/counts.csv", CountChange, "train the run")
 
 
 @dataclass(frozen=True)
@@ -52,18 +41,12 @@ class HeldOutLook:
     """dB; None where no view has the mask."""
 
 
-def _cells(look: HeldOutLook) -> Sequence[object]:
-    psnr = (look.psnr_full, look.psnr_human, look.psnr_vehicle)
-    return f"{look.seconds:.3f}", look.step, *(None if value is None else f"{value:.4f}" for value in psnr)
-
-
-def _look(cells: Sequence[str]) -> HeldOutLook:
-    seconds, step, *psnr = cells
-    return HeldOutLook(float(seconds), int(step), *(float(text) if text else None for text in psnr))
-
-
-HELD_OUT_CURVE = CsvFile(
-    "curves/held_out.csv", tuple(field.name for field in fields(HeldOutLook)), _cells, _look, "train the run"
+HELD_OUT_CURVE = table_of(
+    "curves/held_out.csv",
+    HeldOutLook,
+    "train the run",
+    seconds=".3f",
+    **dict.fromkeys(("psnr_full", "psnr_human", "psnr_vehicle"), ".4f"),
 )
 
 

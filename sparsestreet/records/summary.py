@@ -325,10 +325,6 @@ class RunSummary:
         found = self.quality.get(split or self.main_split, {}).get(metric)
         return None if found is None else found.mean
 
-    def camera_mean(self, metric: str, camera: str) -> float | None:
-        """Return the mean of a metric over one camera's images of ``main_split``; None if not measured."""
-        return self.by_camera[self.main_split].get(camera, {}).get(metric)
-
 
 SUMMARY = JsonFile("records/summary.json", RunSummary)
 

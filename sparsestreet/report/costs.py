@@ -3,19 +3,19 @@
 import math
 import statistics
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
 
 from sparsestreet.metrics.definitions import Protocol
-from sparsestreet.records.costs import COSTS, CostRecord, EffectGain
+from sparsestreet.records.costs import COSTS, CostRecord
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.run import EffectDecision
 from sparsestreet.records.summary import PRESETS
 from sparsestreet.report.collect import TRUTH, UNIT, by_unit, mean_over_scenes, shifts_of
 from sparsestreet.report.tables import ABSENT, BUSY, Cell, Grid, busy_words, number_cell
-from sparsestreet.report.tradeoffs import difference_cell, interval_over_scenes
+from sparsestreet.report.tradeoffs import difference_cell, spread_over_scenes
 from sparsestreet.report.variants import Unit, Variant, busy_variants, plain_of
 
 _CLOCK_OF = {"ms/frame": "frames", "train s": "training"} | dict.fromkeys(("seconds", "ms of a step"), "training")
@@ -121,17 +121,13 @@ def _cells(name: str, found: Sequence[EffectDecision], costs: Sequence[CostRecor
         f"{_text(measured, '{:.2f}')} {BUSY if _busy(costs) and any(measured) else ''}".rstrip(),
         _text([4e-6 * one.numbers for one in found], "{:.3g}"),
         _text([one.gain for one in found], "{:+.2f}"),
-        *(_gain(gains, of) for of in (lambda gain: gain.full, lambda gain: gain.vehicle, lambda gain: gain.human)),
+        *(_text([gain and getattr(gain, of) for gain in gains], "{:+.2f}") for of in ("full", "vehicle", "human")),
     ]
 
 
 def _busy(costs: Sequence[CostRecord | None]) -> bool:
     """Return whether a machine was not quiet while frames were timed with and without each effect."""
     return any(cost is not None and cost.noise is not None and not cost.noise.quiet for cost in costs)
-
-
-def _gain(gains: Sequence[EffectGain | None], of: Callable[[EffectGain], float | None]) -> str:
-    return _text([None if gain is None else of(gain) for gain in gains], "{:+.2f}")
 
 
 def _text(values: Sequence[float | None], form: str) -> str:
@@ -255,10 +251,10 @@ def beside_the_path(variants: Sequence[Variant]) -> Grid | None:
     for variant in variants:
         runs = variant.run_names
         means = [mean_beside(variant, f"{name} at {meters:g} m") for name, meters in columns]
-        texts = [
-            None if mean is None else _beside_text(name, mean) for (name, _), mean in zip(columns, means, strict=True)
+        cells = [
+            Cell() if mean is None else Cell(f"{mean:.2f}" if name.endswith("dB") else f"{mean:.4g}", runs=runs)
+            for (name, _), mean in zip(columns, means, strict=True)
         ]
-        cells = [Cell() if text is None else Cell(text, runs=runs) for text in texts]
         rows.append((Cell(variant.title, runs=runs), *cells))
     header = (("", "arm"), *((name, f"{meters:g} m") for name, meters in columns))
     notes = (
@@ -266,10 +262,6 @@ def beside_the_path(variants: Sequence[Variant]) -> Grid | None:
         "and says nothing by its level; only that of Inception's features is the published FID",
     )
     return Grid("beside", "Beside the recorded path", header, tuple(rows), notes)
-
-
-def _beside_text(name: str, mean: float) -> str:
-    return f"{mean:.2f}" if name.endswith("dB") else f"{mean:.4g}"
 
 
 _REGIONS = ("full", "human", "vehicle")
@@ -331,9 +323,9 @@ def _preset_rows(
         cells = [Cell(title, runs=runs), Cell(name, runs=runs), Cell(str(n), runs=runs)]
         for metric in (protocol.psnr, protocol.human[0], protocol.vehicle[0]):
             ours, theirs = by_unit(found, metric), by_unit(trained, metric)
-            interval = None if found.equals(trained) else interval_over_scenes((ours - theirs).dropna())
+            gain = None if found.equals(trained) else spread_over_scenes((ours - theirs).dropna())
             cells.append(number_cell(mean_over_scenes(ours), "{:.2f}", runs))
-            cells.append(difference_cell(interval, "{:+.2f}", n, runs))
+            cells.append(difference_cell(gain, "{:+.2f}", n, runs))
         for _, heading, form in _COSTS:
             mark = _busy_renders(renders) if heading == "ms/frame" else ""
             cells.append(number_cell(mean_over_scenes(by_unit(found, heading)), form, runs, mark))

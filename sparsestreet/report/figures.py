@@ -211,7 +211,7 @@ def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str
     of the means; controls are gray and in no front.
     """
     wanted = {"full image": protocol.psnr, "people": protocol.human[0], "vehicles": protocol.vehicle[0]}
-    regions = {name: _held_out(metric) for name, metric in wanted.items()}
+    regions = {name: f"{HELD_OUT} {metric}" for name, metric in wanted.items()}
     regions = {
         name: value for name, value in regions.items() if any(variant.mean(value) is not None for variant in variants)
     }
@@ -228,10 +228,6 @@ def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str
     legend_below(figure, _legend(variants))
     write_svg(figure, path, says)
     return True
-
-
-def _held_out(metric: str) -> str:
-    return f"{HELD_OUT} {metric}"
 
 
 def _pareto_panel(axes: Axes, variants: Sequence[Variant], of: tuple[str, str, str], quality: str, region: str) -> Says:
@@ -479,15 +475,14 @@ def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> 
     Curves are means over scenes and seeds at each look. Without curves, only the end of training is drawn. Raises
     ValueError if no run has a held-out PSNR.
     """
-    shown = [
-        variant for variant in variants if not variant.control and variant.mean(_held_out(protocol.psnr)) is not None
-    ]
+    quality = f"{HELD_OUT} {protocol.psnr}"
+    shown = [variant for variant in variants if not variant.control and variant.mean(quality) is not None]
     if not shown:
         raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
     figure, (training, frame) = panels(2, width=4.6, height=4.0)
     for variant in shown:
-        _over_training(training, variant, shown, protocol)
-        _draw_points(frame, variant, shown, "ms/frame", protocol)
+        _over_training(training, variant, shown, quality)
+        _draw_points(frame, variant, shown, "ms/frame", quality)
     training.set_xlabel("training seconds")
     frame.set_xlabel("milliseconds a frame")
     training.set_ylabel("held-out PSNR, dB")
@@ -497,32 +492,25 @@ def time_figure(variants: Sequence[Variant], protocol: Protocol, path: Path) -> 
     figure.savefig(path, dpi=150, facecolor="white", metadata={"Software": None})
 
 
-def _over_training(axes: Axes, variant: Variant, shown: Sequence[Variant], protocol: Protocol) -> None:
+def _over_training(axes: Axes, variant: Variant, shown: Sequence[Variant], quality: str) -> None:
     curves = list(curves_of(variant).values())
     if not curves:
-        _draw_points(axes, variant, shown, "train s", protocol)
+        _draw_points(axes, variant, shown, "train s", quality)
         return
-    mean = mean_curve(curves)
-    look, end = styles(shown)[variant.name], [len(mean.seconds) - 1]
-    dashes = _DASHES_OF_KIND.get(look.kind, "-.")
-    paint = _paint(styles(shown), variant)
-    axes.plot(
-        mean.seconds, mean.psnr, color=paint, linestyle=dashes, marker=look.marker, markevery=end, label=_label(variant)
-    )
+    mean, look = mean_curve(curves), _look(shown, variant)
+    dashes = _DASHES_OF_KIND.get(styles(shown)[variant.name].kind, "-.")
+    axes.plot(mean.seconds, mean.psnr, linestyle=dashes, markevery=[len(mean.seconds) - 1], **look)
 
 
-def _draw_points(axes: Axes, variant: Variant, shown: Sequence[Variant], cost: str, protocol: Protocol) -> None:
+def _draw_points(axes: Axes, variant: Variant, shown: Sequence[Variant], cost: str, quality: str) -> None:
     """Draw the mean, and every run small and pale."""
-    points = _points(variant, cost, _held_out(protocol.psnr))
-    if points.empty:
-        return
-    paint = _paint(styles(shown), variant)
-    axes.scatter(points["cost"], points["quality"], s=8, color=paint, alpha=0.5)
-    marker = styles(shown)[variant.name].marker
-    axes.scatter(*_mean_point(points), s=44, color=paint, marker=marker, label=_label(variant), zorder=3)
+    points, look = _points(variant, cost, quality), _look(shown, variant)
+    if not points.empty:
+        axes.scatter(points["cost"], points["quality"], s=8, color=look["color"], alpha=0.5)
+        axes.scatter(*_mean_point(points), s=44, zorder=3, **look)
 
 
-def _label(variant: Variant) -> str:
-    return (
-        f"{variant.title} (machine not quiet)" if variant.busy("frames") or variant.busy("training") else variant.title
-    )
+def _look(shown: Sequence[Variant], variant: Variant) -> dict[str, Any]:
+    style, busy = styles(shown), variant.busy("frames") or variant.busy("training")
+    label = f"{variant.title} (machine not quiet)" if busy else variant.title
+    return {"color": _paint(style, variant), "marker": style[variant.name].marker, "label": label}

@@ -15,7 +15,7 @@ from sparsestreet.records.configuration import Setting, config_hash, differing_o
 from sparsestreet.records.run import CodeVersion, Machine
 from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
 from sparsestreet.report.collect import UNIT, RunRecord, by_scene, by_unit, check_definitions, of_runs, summary_frame
-from sparsestreet.report.tables import ABSENT, BUSY, CAPPED, Spread, busy_note, markdown_lines, spread
+from sparsestreet.report.tables import ABSENT, BUSY, CAPPED, Quantity, Spread, busy_note, markdown_lines, spread
 from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
 
 
@@ -36,12 +36,6 @@ def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) ->
         *_caps(variants),
         _guards(variants),
     ]
-
-
-def camera_notes(variants: Sequence[Repeats]) -> list[str]:
-    """Return the notes of a table by camera. All other notes stand below the table that precedes it."""
-    runs = [run for variant in variants for run in variant.runs]
-    return [f"PSNR in dB of {_views(runs)}, the mean over the images of each camera; the rest as above"]
 
 
 def _general(runs: Sequence[RunSummary], over_scenes: bool, protocol: Protocol) -> list[str]:
@@ -207,23 +201,6 @@ def _run(variant: Repeats, run: RunSummary) -> str:
     return f"{variant.name} (seed {run.run.seed})"
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """One quantity of the table."""
-
-    heading: str
-    column: str
-    """Of ``summary_frame``."""
-    text: str
-    """Format of its mean."""
-    relative: bool = False
-    """True: a comparison with the baseline reads as per cent of it (what remains). False: as a signed difference."""
-    count: bool = False
-    """Whether it counts Gaussians, which a cap can limit."""
-    clock: str = ""
-    """What is timed, a key of ``CLOCKS``: a time of a machine that was not quiet compares with none. Empty: no time."""
-
-
 def protocol_metrics(protocol: Protocol) -> tuple[tuple[str, str, str], ...]:
     """Return heading, id and format of each metric of a protocol, and of the metrics by lidar.
 
@@ -298,7 +275,7 @@ class Row:
     difference: bool
     capped: bool
     """Whether a node's ``max_gaussians`` limited one of its counts."""
-    busy: tuple[bool, ...] = ()
+    busy: tuple[bool, ...]
     """For each cell: whether a time of a machine that was not quiet is in it or, of a difference, left out of it."""
 
 
@@ -433,7 +410,9 @@ def _sections(
     cameras = camera_quantities(group.runs)
     if not cameras:
         return [whole]
-    return [whole, section(f"PSNR by camera, {title}", True, cameras, camera_notes(ordered))]
+    # All other notes stand below the table that precedes it.
+    said = [f"PSNR in dB of {_views(group.runs)}, the mean over the images of each camera; the rest as above"]
+    return [whole, section(f"PSNR by camera, {title}", True, cameras, said)]
 
 
 def _variant_row(variant: Repeats, columns: Sequence[Quantity], over_scenes: bool) -> Row:
@@ -568,13 +547,11 @@ def _table(lines: Sequence[Sequence[str]]) -> Table:
 def _lines(section: Section) -> list[list[str]]:
     """Return header and rows as texts."""
     header = ["method", "runs", *(quantity.heading for quantity in section.quantities)]
-    return [header, *(_texts(row, section.quantities) for row in section.rows)]
-
-
-def _texts(row: Row, quantities: Sequence[Quantity]) -> list[str]:
-    busy = row.busy or (False,) * len(quantities)
-    cells = [_cell(*one, row) for one in zip(row.cells, quantities, busy, strict=True)]
-    return [row.label, row.runs, *cells]
+    rows = [
+        [row.label, row.runs, *(_cell(*one, row) for one in zip(row.cells, section.quantities, row.busy, strict=True))]
+        for row in section.rows
+    ]
+    return [header, *rows]
 
 
 def _cell(cell: Spread | None, quantity: Quantity, busy: bool, row: Row) -> str:

@@ -48,6 +48,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     failures = read_failures(sweep)
     records = sweep_records(sweep)
     found = variants(records)
+    alike = effects_alike(found)
     grids = _grids(found, failures, protocol, name)
     said = summary_line(found, protocol)
     folder = sweep / "report"
@@ -57,7 +58,7 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
         *why_apart(found),
         *_caps(found),
         *busy_variants(found),
-        *_effects_alike(found),
+        *([f"{alike}: records/cost.json of a run has what each costs and brings"] if alike else []),
         *_baseline(found),
         *_unfinished(records),
         *absent,
@@ -150,11 +151,6 @@ def _figures(found: Sequence[Variant], protocol: Protocol, folder: Path) -> tupl
             path.unlink(missing_ok=True)  # that of an earlier report
             absent.append(lacking)
     return drawn, absent
-
-
-def _effects_alike(found: Sequence[Variant]) -> list[str]:
-    alike = effects_alike(found)
-    return [f"{alike}: records/cost.json of a run has what each costs and brings"] if alike else []
 
 
 def _baseline(found: Sequence[Variant]) -> list[str]:

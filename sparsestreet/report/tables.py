@@ -153,12 +153,46 @@ def comma_separated(grids: Sequence[Grid]) -> str:
 
 
 @dataclass(frozen=True)
+class Quantity:
+    """A column of numbers and of their differences to a baseline."""
+
+    heading: str
+    column: str
+    """Of ``run_frame``."""
+    text: str
+    """Format of its mean."""
+    relative: bool = False
+    """True: a comparison with the baseline is in per cent of it. False: it is a signed difference."""
+    count: bool = False
+    """Whether it counts Gaussians, which a cap can limit."""
+    clock: str = ""
+    """What is timed, a key of ``CLOCKS``: a time of a machine that was not quiet compares with none. Empty: no time."""
+
+
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
 class Spread:
     """A mean with the sample standard deviation (n - 1); the latter is None below two values."""
 
     mean: float
     sd: float | None
     n: int
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """The t interval with n - 1 degrees of freedom, which holds the true mean with ``CONFIDENCE`` if values are
+        normal; None for a single value, which says nothing about its spread."""
+        if self.sd is None:
+            return None
+        reach = float(stdtrit(self.n - 1, (1 + CONFIDENCE) / 2)) * self.sd / math.sqrt(self.n)
+        return self.mean - reach, self.mean + reach
+
+    @property
+    def proven(self) -> bool:
+        """Whether the interval excludes 0."""
+        return self.interval is not None and (self.interval[0] > 0 or self.interval[1] < 0)
 
 
 def spread(values: Sequence[float]) -> Spread | None:
@@ -170,41 +204,6 @@ def spread(values: Sequence[float]) -> Spread | None:
     if not values:
         return None
     return Spread(statistics.fmean(values), statistics.stdev(values) if len(values) > 1 else None, len(values))
-
-
-CONFIDENCE = 0.95
-
-
-@dataclass(frozen=True)
-class ConfidenceInterval:
-    """A mean with an interval that holds the true mean with ``CONFIDENCE`` if the differences are normal."""
-
-    mean: float
-    low: float | None
-    """None for a single value, which says nothing about its spread."""
-    high: float | None
-    n: int
-
-    @property
-    def proven(self) -> bool:
-        """Whether the interval excludes 0."""
-        return self.low is not None and self.high is not None and (self.low > 0 or self.high < 0)
-
-
-def t_interval(values: Sequence[float]) -> ConfidenceInterval | None:
-    """Return the mean and the t interval with n - 1 degrees of freedom; None without values.
-
-    >>> interval = t_interval([0.2, 0.3, 0.4])
-    >>> f"{interval.mean:.2f} [{interval.low:.2f}, {interval.high:.2f}]", interval.proven
-    ('0.30 [0.05, 0.55]', True)
-    """
-    if not values:
-        return None
-    mean, n = statistics.fmean(values), len(values)
-    if n == 1:
-        return ConfidenceInterval(mean, None, None, 1)
-    reach = float(stdtrit(n - 1, (1 + CONFIDENCE) / 2)) * statistics.stdev(values) / math.sqrt(n)
-    return ConfidenceInterval(mean, mean - reach, mean + reach, n)
 
 
 CAPPED = "†"

@@ -9,16 +9,7 @@ import pandas as pd
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.summary import HELD_OUT
 from sparsestreet.report.collect import by_scene, mean_over_scenes
-from sparsestreet.report.tables import (
-    BUSY,
-    CAPPED,
-    CONFIDENCE,
-    Cell,
-    ConfidenceInterval,
-    Grid,
-    number_cell,
-    t_interval,
-)
+from sparsestreet.report.tables import BUSY, CAPPED, CONFIDENCE, Cell, Grid, Quantity, Spread, number_cell, spread
 from sparsestreet.report.variants import Variant, busy_variants, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
@@ -27,22 +18,8 @@ SHARES = (0.25, 0.5, 0.75)
 """Shares of the plain variant's Gaussians that a smaller variant may keep."""
 
 
-@dataclass(frozen=True)
-class Measure:
-    """A column of differences."""
-
-    heading: str
-    column: str
-    """Of ``run_frame``."""
-    text: str
-    relative: bool
-    """Whether the difference is in per cent of the plain run's value."""
-    clock: str = ""
-    """What is timed, a key of ``CLOCKS``; empty: no time."""
-
-
-def measures(protocol: Protocol) -> tuple[Measure, ...]:
-    """Return the columns of quality under a protocol, and of its costs."""
+def measures(protocol: Protocol) -> tuple[Quantity, ...]:
+    """Return the columns of quality under a protocol, and of its costs, with formats of their differences."""
     quality = (
         ("PSNR full", protocol.psnr, "{:+.2f}"),
         ("PSNR human", protocol.human[0], "{:+.2f}"),
@@ -51,34 +28,28 @@ def measures(protocol: Protocol) -> tuple[Measure, ...]:
         *((f"LPIPS {name.split('_')[1]}", name, "{:+.4f}") for name in protocol.lpips),
     )
     return (
-        *(Measure(heading, _held_out(metric), text, False) for heading, metric, text in quality),
-        Measure("Gaussians", "Gaussians", "{:+.1f}", True),
-        Measure("MB", "MB", "{:+.1f}", True),
-        Measure("ms/frame", "ms/frame", "{:+.1f}", True, "frames"),
-        Measure("train s", "train s", "{:+.1f}", True, "training"),
+        *(Quantity(heading, f"{HELD_OUT} {metric}", text) for heading, metric, text in quality),
+        Quantity("Gaussians", "Gaussians", "{:+.1f}", relative=True),
+        Quantity("MB", "MB", "{:+.1f}", relative=True),
+        Quantity("ms/frame", "ms/frame", "{:+.1f}", relative=True, clock="frames"),
+        Quantity("train s", "train s", "{:+.1f}", relative=True, clock="training"),
     )
 
 
-def _held_out(metric: str) -> str:
-    return f"{HELD_OUT} {metric}"
-
-
-def paired(
-    variant: Variant, plain: Variant, column: str, relative: bool = False, clock: str = ""
-) -> ConfidenceInterval | None:
+def paired(variant: Variant, plain: Variant, column: str, relative: bool = False, clock: str = "") -> Spread | None:
     """Return the difference to the plain variant over the pairs of scene and seed that both have.
 
     ``relative``: in per cent of the plain variant's number. With a ``clock``, runs of a busy machine are left out.
     """
     ours, theirs = variant.units(column, clock=clock), plain.units(column, clock=clock)
     differences = 100 * (ours / theirs[theirs != 0] - 1) if relative else ours - theirs
-    return interval_over_scenes(differences.dropna())
+    return spread_over_scenes(differences.dropna())
 
 
-def interval_over_scenes(units: pd.Series) -> ConfidenceInterval | None:
-    """Return the t interval over scenes, each with the mean of its seeds; over the seeds of a single scene."""
+def spread_over_scenes(units: pd.Series) -> Spread | None:
+    """Return the spread over scenes, each with the mean of its seeds; over the seeds of a single scene."""
     scenes = by_scene(units)
-    return t_interval((scenes if len(scenes) > 1 else units).tolist())
+    return spread((scenes if len(scenes) > 1 else units).tolist())
 
 
 def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
@@ -94,12 +65,12 @@ def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
             continue
         runs = variant.run_names + plain.run_names
         found = [paired(variant, plain, one.column, one.relative, one.clock) for one in shown]
-        n = max((interval.n for interval in found if interval), default=0)
+        n = max((gain.n for gain in found if gain), default=0)
         cells = [
             Cell(BUSY, runs=runs)
-            if interval is None and one.clock and (variant.busy(one.clock) or plain.busy(one.clock))
-            else difference_cell(interval, one.text, n, runs)
-            for interval, one in zip(found, shown, strict=True)
+            if gain is None and one.clock and (variant.busy(one.clock) or plain.busy(one.clock))
+            else difference_cell(gain, one.text, n, runs)
+            for gain, one in zip(found, shown, strict=True)
         ]
         rows.append((Cell(f"{variant.title} - {_named(plain)}", runs=runs), Cell(str(n), runs=runs), *cells))
     notes = [
@@ -131,24 +102,20 @@ def _caps(variants: Sequence[Variant]) -> tuple[str, ...]:
     return (f"{CAPPED} {', '.join(held)}: {said}",) if held else ()
 
 
-def difference_cell(interval: ConfidenceInterval | None, form: str, n: int, runs: tuple[str, ...]) -> Cell:
+def difference_cell(gain: Spread | None, form: str, n: int, runs: tuple[str, ...]) -> Cell:
     """Return mean and interval, bold if it excludes 0; with its own n if that is not the row's.
 
-    >>> difference_cell(t_interval([-0.3, -0.2, -0.1]), "{:+.2f}", 3, ()).text
+    >>> difference_cell(spread([-0.3, -0.2, -0.1]), "{:+.2f}", 3, ()).text
     '-0.20 [-0.45, +0.05]'
     """
-    if interval is None:
+    if gain is None:
         return Cell()
-    text = form.format(interval.mean)
-    if interval.low is not None:
-        text += f" [{form.format(interval.low)}, {form.format(interval.high)}]"
-    text = text if interval.n == n else f"{text} (n={interval.n})"
-    return Cell(text, interval.proven, runs=runs, exact=_exactly(interval))
-
-
-def _exactly(interval: ConfidenceInterval) -> str:
-    spread = "" if interval.low is None else f", interval {interval.low:.6g} to {interval.high:.6g}"
-    return f"{interval.mean:.6g}{spread}, n = {interval.n}"
+    text, exact = form.format(gain.mean), f"{gain.mean:.6g}"
+    if gain.interval is not None:
+        text += " [{}, {}]".format(*map(form.format, gain.interval))
+        exact += ", interval {:.6g} to {:.6g}".format(*gain.interval)
+    text = text if gain.n == n else f"{text} (n={gain.n})"
+    return Cell(text, gain.proven, runs=runs, exact=f"{exact}, n = {gain.n}")
 
 
 @dataclass(frozen=True)
@@ -157,7 +124,7 @@ class _Candidate:
 
     variant: Variant
     plain: Variant
-    gain: ConfidenceInterval
+    gain: Spread
     """dB, negative if the variant is worse."""
     share: float
     """Per cent of the plain variant's Gaussians that remain."""
@@ -173,7 +140,7 @@ def _candidates(plain: Variant, variants: Sequence[Variant], protocol: Protocol)
     for variant in variants:
         if plain_of(variant, variants) is not plain:
             continue
-        gain = paired(variant, plain, _held_out(protocol.psnr))
+        gain = paired(variant, plain, f"{HELD_OUT} {protocol.psnr}")
         share = paired(variant, plain, "Gaussians", relative=True)
         if gain is not None and share is not None:
             found.append(_Candidate(variant, plain, gain, 100 * (1 + share.mean / 100)))
@@ -277,7 +244,7 @@ def summary_line(variants: Sequence[Variant], protocol: Protocol) -> tuple[str, 
         smaller = [one for one in compared if one.gain.mean >= -LOSS and one.share < 100]
         best = min(smaller, key=lambda one: one.share, default=None)
         found.append(_sentence(plain, compared, best))
-        wide += [best.variant.name] if best and best.gain.low is not None and best.gain.low < -LOSS else []
+        wide += [best.variant.name] if best and best.gain.interval and best.gain.interval[0] < -LOSS else []
         held += [plain.name] if is_capped(plain) else []
     if wide:
         found.append(
@@ -298,5 +265,5 @@ def _sentence(plain: Variant, compared: Sequence[_Candidate], best: _Candidate |
 
 def _numbers(one: _Candidate) -> str:
     gain = one.gain
-    interval = "" if gain.low is None else f" [{gain.low:+.2f}, {gain.high:+.2f}]"
+    interval = " [{:+.2f}, {:+.2f}]".format(*gain.interval) if gain.interval else ""
     return f"{one.share:.0f} % of the Gaussians, {gain.mean:+.2f} dB{interval} of held-out PSNR, n = {gain.n}"

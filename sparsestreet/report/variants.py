@@ -79,7 +79,8 @@ def repeats(runs: Sequence[RunSummary], everywhere: Sequence[RunSummary] = ()) -
         here, given_here = _options(group[0], runs)
         options = (*_not_of_data(anywhere), *_of_data(here))
         named = (*_not_of_data(given_anywhere), *_of_data(given_here))
-        found.append((Repeats(_name(label, named, identity), label, options, tuple(group)), identity))
+        name = f"{label} {in_few_words(named, identity)}".rstrip()
+        found.append((Repeats(name, label, options, tuple(group)), identity))
     shared = Counter(variant.name for variant, _ in found)
     # Some differences have no words, such as an option that is null in one variant and absent in another.
     unique = [
@@ -154,10 +155,6 @@ def _of_data(options: Iterable[str]) -> list[str]:
 
 def _not_of_data(options: Iterable[str]) -> list[str]:
     return [option for option in options if not key_of(option).startswith("data.")]
-
-
-def _name(label: str, options: Sequence[str], identity: str) -> str:
-    return f"{label} {in_few_words(options, identity)}".rstrip()
 
 
 def in_few_words(options: Sequence[str], identity: str) -> str:

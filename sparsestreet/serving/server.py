@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, NoReturn
 
@@ -61,15 +60,6 @@ class GoneError(Exception):
     """Nobody waits for the answer any more: the request was canceled, or its deadline passed."""
 
 
-@dataclass(frozen=True)
-class Spent:
-    """Milliseconds of one picture."""
-
-    waited: float
-    rendered: float
-    encoded: float = 0.0
-
-
 class Sensorsim:
     """The calls of SensorsimService; each takes a message and gRPC's context, and returns a message."""
 
@@ -84,7 +74,8 @@ class Sensorsim:
         image, spent = self._rendered(request, context)
         started = time.perf_counter()
         data = encoded(image, request.image_format, request.image_quality)
-        _tell(context, Spent(spent.waited, spent.rendered, 1000 * (time.perf_counter() - started)))
+        spent["encode-ms"] = 1000 * (time.perf_counter() - started)
+        context.set_trailing_metadata(tuple((name, f"{value:.3f}") for name, value in spent.items()))
         return wire.kind("RGBRenderReturn")(image_bytes=data)
 
     def batch_render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
@@ -159,7 +150,8 @@ class Sensorsim:
     def render_aggregated(self, request: Any, context: grpc.ServicerContext) -> Any:
         raise NotServedError("this server has no lidar, so nothing to aggregate: call batch_render_rgb")
 
-    def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, Spent]:
+    def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, dict[str, float]]:
+        """Return the picture and what it took, milliseconds, as the answer's trailing metadata call it."""
         served: ServedScene = self.scenes.get(request.scene_id)
         view, edits = view_of(request, served.rig), edits_of(request, served)
         self._note_guess(served, view)
@@ -167,7 +159,7 @@ class Sensorsim:
         with self._device.turn(partial(_check_wanted, context)):
             started = time.perf_counter()
             image = picture(served, view, edits)
-        return image, Spent(1000 * (started - asked), 1000 * (time.perf_counter() - started))
+        return image, {"wait-ms": 1000 * (started - asked), "render-ms": 1000 * (time.perf_counter() - started)}
 
     def _note_guess(self, served: ServedScene, view: View) -> None:
         """One line of the log for each scene, at the first picture from where no camera was."""
@@ -275,9 +267,3 @@ def _refuse(context: grpc.ServicerContext, code: grpc.StatusCode, said: str) -> 
 def _check_wanted(context: grpc.ServicerContext) -> None:
     if not context.is_active():
         raise GoneError
-
-
-def _tell(context: grpc.ServicerContext, spent: Spent) -> None:
-    """What a picture took, behind the answer: ``wait-ms``, ``render-ms``, ``encode-ms``."""
-    entries = (("wait-ms", spent.waited), ("render-ms", spent.rendered), ("encode-ms", spent.encoded))
-    context.set_trailing_metadata(tuple((name, f"{value:.3f}") for name, value in entries))

@@ -16,7 +16,7 @@ from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.cli.config.compose import resolved
 from sparsestreet.cli.runs import run as run_module
 from sparsestreet.cli.runs import run as step_module
-from sparsestreet.cli.runs.run import NEVER, data_of, identity_of, recipe_of, run, train_with
+from sparsestreet.cli.runs.run import NEVER, data_of, recipe_of, run, train_with, with_images
 from sparsestreet.data.synthetic.reader import StreetReader
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
@@ -77,21 +77,6 @@ def test_every_value_of_a_recipe():
     assert recipe_of(composed(*(f"~effects.{name}" for name in cfg.effects))).effects == {}
 
 
-def test_the_split_and_the_order_are_the_configurations(log):
-    data = data_of(composed(*WORDS))
-    assert data.driving_log == log
-    assert (data.seed, data.val_frames, data.split_in_words) == (7, 2, "every 4th frame from 1")
-    assert data.split.held_out_indices == {1, 5, 9}
-
-
-def test_a_run_is_called_what_its_configuration_says(log):
-    cfg = composed(*WORDS)
-    identity = identity_of(cfg, "typed")
-    assert (identity.label, identity.method, identity.sparsify) == ("mine", "3dgs", "removal")
-    assert (identity.data_hash, identity.command) == ("c0ffee", "typed")
-    assert identity.config == flat_config(resolved(cfg))
-
-
 def test_a_key_of_an_earlier_version_has_one_clear_error(log):
     """As a run has it that is evaluated again; also where its value is nothing."""
     old = OmegaConf.merge(composed(*WORDS), OmegaConf.create({"data": {"log": {}}}))
@@ -115,6 +100,8 @@ def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, 
     started = time.perf_counter() - 3
     assert run(composed(*words), tmp_path, started) == (21.5 if summary else 0.0)
     (((recipe, data, out), how),) = called
+    assert (data.seed, data.val_frames, data.split_in_words) == (7, 2, "every 4th frame from 1")
+    assert data.split.held_out_indices == {1, 5, 9}
     assert order == [
         "keep_freed_memory",
         "forget_peaks",
@@ -125,7 +112,10 @@ def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, 
     assert (how["max_steps"], how["checkpoint_every"]) == (90, 30)
     assert how["make_trainer"].keywords["log_every_n_steps"] == 4
     assert Path(how["logger"].root_dir) == Path()
-    assert (how["identity"].label, how["identity"].command) == ("mine", "sparsestreet train seed=7 'out=a b'")
+    identity, known = how["identity"], with_images(composed(*words), len(data.split.train))
+    assert (identity.label, identity.method, identity.sparsify) == ("mine", "3dgs", "removal")
+    assert (identity.data_hash, identity.command) == ("c0ffee", "sparsestreet train seed=7 'out=a b'")
+    assert identity.config == flat_config(resolved(known))
     assert how["extra"] == ExtraMetrics(novel=[1.5], presets=[], timing=Timing(20, 50, 3))
     assert how["resume"] == (Path(resume) if resume else None)
     seconds = how["stages"].seconds()

@@ -52,12 +52,9 @@ def test_the_options_of_the_reader_that_is_found_apply(tmp_path):
     assert composed(*words).data == composed("data=kitti", f"data.root={tmp_path}", "seed=3").data
 
 
-def test_an_empty_folder_is_one_line(tmp_path):
+def test_a_folder_that_no_reader_knows_lists_what_each_missed(tmp_path):
     with pytest.raises(ValueError, match=rf"data.root={tmp_path} is an empty folder: name that of a log; [^\n]*$"):
         found_option(tmp_path)
-
-
-def test_a_folder_that_no_reader_knows_lists_what_each_missed(tmp_path):
     with pytest.raises(ValueError, match="no reader knows") as error:
         found_option(touch(tmp_path, "photo.jpg"))
     lines = str(error.value).splitlines()

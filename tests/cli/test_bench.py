@@ -12,9 +12,9 @@ from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.cli.commands import bench as cli_bench
 from sparsestreet.cli.commands.bench import bench, trained_street
 from sparsestreet.cli.runs import run as cli_step
-from sparsestreet.scene.storage import load_scene, save_scene
-from sparsestreet.scene.views import read_views, write_views
-from tests.export.street import stored_street, street_views
+from sparsestreet.scene.storage import load_scene
+from sparsestreet.scene.views import read_views
+from tests.export.street import write_street
 
 
 def test_records_name_command_and_threads(tmp_path, capsys):
@@ -30,16 +30,13 @@ def handed(monkeypatch):
     """What each mode hands to its measurement, which is replaced: positional and named arguments."""
     given = {}
 
-    def replaced(module, name, answer):
-        monkeypatch.setattr(module, name, lambda *args, **named: given.update({name: (args, named)}) or answer)
+    def replaced(module, name):
+        monkeypatch.setattr(module, name, lambda *args, **named: given.update({name: (args, named)}))
 
-    for module, name in (
-        (settings_sweep, "run_sweep"),
-        (blend, "run_blend"),
-        (scaling, "run_scaling"),
-    ):
-        replaced(module, name, None)
-    replaced(step, "run_step", None)
+    replaced(settings_sweep, "run_sweep")
+    replaced(blend, "run_blend")
+    replaced(scaling, "run_scaling")
+    replaced(step, "run_step")
     monkeypatch.setattr(
         figures, "draw_pareto", lambda records, folder: given.update(drawn=(records, folder)) or ["a.svg"]
     )
@@ -90,9 +87,7 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
 
 def test_the_street_of_a_run_is_the_view_in_its_middle(tmp_path):
     """Of five frames and four cameras, 20 views, in their order: the eleventh."""
-    save_scene(tmp_path / "run" / "scene.safetensors", stored_street())
-    views = street_views()
-    write_views(tmp_path / "run" / "views.json", views[:15], views[15:])
+    write_street(tmp_path / "run")
     street, stored = trained_street(tmp_path / "run"), load_scene(tmp_path / "run")
     middle = read_views(tmp_path / "run" / "views.json").all[10]
     assert (street.name, street.source) == (

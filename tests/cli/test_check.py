@@ -76,29 +76,11 @@ MISSING = [
     (torch.version, "cuda", None, "torch", "is a build without CUDA: pip uninstall torch"),
     (torch.cuda, "is_available", too_old, "device", "the driver is too old (found 12020).: a driver must be as new as"),
     (torch.cuda, "get_device_capability", lambda: (7, 5), "device", "compute capability 7.5, and kernels need 8.0"),
-    (
-        torch,
-        "ones",
-        fails("CUDA error: no kernel image"),
-        "device",
-        "cannot compute on NVIDIA H100",
-    ),
-    (
-        shutil,
-        "which",
-        lambda name: None,
-        "compiler",
-        "there is no C compiler, and Triton calls one",
-    ),
+    (torch, "ones", fails("CUDA error: no kernel image"), "device", "cannot compute on NVIDIA H100"),
+    (shutil, "which", lambda name: None, "compiler", "there is no C compiler, and Triton calls one"),
     (sysconfig, "get_path", lambda name: "/nowhere", "headers", "there is no /nowhere/Python.h, which Triton compiles"),
     (torch.cuda, "mem_get_info", lambda: (0.4e9, 80.0e9), "memory", "0.4 of 80.0 GB are free: nvidia-smi lists who"),
-    (
-        accuracy,
-        "answer",
-        fails("ptxas fatal"),
-        "splat",
-        "RuntimeError: ptxas fatal; with the versions",
-    ),
+    (accuracy, "answer", fails("ptxas fatal"), "splat", "RuntimeError: ptxas fatal; with the versions"),
 ]
 
 

@@ -22,7 +22,7 @@ from sparsestreet.export.ply import scene_gaussians, write_ply
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
-from tests.export.street import CAR_ROWS, stored_street, street_views
+from tests.export.street import CAR_ROWS, stored_street, street_views, write_street
 from tests.serving.street import write_run
 
 MODULES = {
@@ -38,12 +38,7 @@ def command(name: str) -> Callable[[list[str]], int]:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
     """A folder with what a training leaves: a scene and views of 5 frames and 4 cameras; frame 2 is held out."""
-    folder = tmp_path_factory.mktemp("commands") / "run"
-    save_scene(folder / "scene.safetensors", stored_street())
-    views = street_views()
-    others, held_out = ([view for view in views if (view.frame_index == 2) == held] for held in (False, True))
-    write_views(folder / "views.json", others, held_out, frame_rate=4.0)
-    return folder
+    return write_street(tmp_path_factory.mktemp("commands") / "run", frame_rate=4.0)
 
 
 SLIPS = [
@@ -82,6 +77,9 @@ SLIPS = [
     ("serve", "port=70000", 2, "port lies in 0 to 65535"),
     ("serve", "mount=1,2", 2, "mount is three numbers"),
     ("view", "fps=0", 2, "fps lies in 1 to 60, got 0"),
+    ("view", "port=99999", 2, "a port lies in 0 to 65535"),
+    ("view", "known_as=[http://a]", 2, "without http:// and port, got 'http://a'"),
+    ("view", "scene=nowhere", 1, "there is no scene at nowhere"),
     ("evaluate", "novel=1,0", 2, "novel"),
     ("evaluate", "presets=fast,quick", 2, "no settings preset 'quick': choose one of"),
     ("report", "basline=plain", 2, "no key 'basline'; did you mean 'baseline'?"),

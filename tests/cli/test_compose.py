@@ -174,18 +174,7 @@ def test_the_log_of_a_run_is_looked_for_where_the_run_had_it(tmp_path):
     assert folder_of_the_log(tmp_path / "e", tmp_path / "gone", *recorded) == Path("logs/7")
 
 
-PATHS = (
-    "/l/ö",
-    "/l/a,b",
-    "/l/it's",
-    "/l/50%&#x",
-    "/l/[x]",
-    "l\\b'c\\",
-    '日本/ä "q"',
-    "123",
-    "true",
-    "/l/a ",
-)
+PATHS = ("/l/ö", "/l/a,b", "/l/it's", "/l/50%&#x", "/l/[x]", "l\\b'c\\", '日本/ä "q"', "123", "true", "/l/a ")
 """Folders as a shell hands them over: without its own quotes."""
 
 

@@ -24,6 +24,7 @@ from sparsestreet.cli.runs.run import data_of, recipe_of
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.pruning import RenderContext
 from sparsestreet.records.costs import COSTS
+from sparsestreet.records.curves import LOGGED
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.density import GradientDensity
@@ -213,21 +214,15 @@ def test_the_scene_opens_and_shows_what_the_run_showed(run):
     assert without.effects["sky"] is stored.scene.effects["sky"]
 
 
-def test_its_regularizer_is_among_the_terms_of_the_loss(run):
-    with (run / "curves" / "metrics.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row.get("train/bobbing/stillness")]
-    assert float(rows[0]["train/bobbing/stillness"]) > 0
-
-
-def test_it_is_trained_with_its_regularizer(run):
+def test_regularizers_are_among_the_terms_of_the_loss(run):
     gain = load_scene(run).scene.effects["gain"]
     assert isinstance(gain, Gain)
     # Two cameras, and steps of about the learning rate.
     assert gain.log_gains.shape == (2,)
     assert 0.005 < gain.log_gains.abs().max() < 0.01 * STEPS
-    with (run / "curves" / "metrics.csv").open() as file:
-        terms = [float(row["train/gain/evenness"]) for row in csv.DictReader(file) if row.get("train/gain/evenness")]
-    assert max(terms) > 0
+    rows = LOGGED.rows(run)
+    for term in ("train/bobbing/stillness", "train/gain/evenness"):
+        assert max(float(row[term]) for row in rows if row[term]) > 0
 
 
 def test_it_is_timed_counted_and_reported(run, capsys):

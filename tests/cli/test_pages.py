@@ -96,35 +96,19 @@ def test_what_does_not_run_in_the_test_of_all_commands_has_a_test_of_its_own():
 
 
 def python_of(name: str) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / "docs" / name).read_text(), flags=re.S)
+    return re.findall(r"```python\n(.*?)```", (ROOT / name).read_text(), flags=re.S)
 
 
 def test_the_page_of_python_renders_edits_and_drives(finished, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "RUN").symlink_to(finished)
     with unchecked():
-        exec("".join(python_of("python.md")[:-1]), {})
+        exec("".join(python_of("docs/python.md")[:-1]), {})
     shapes, error, changed, seen = capsys.readouterr().out.splitlines()[-4:]
     assert shapes.startswith("torch.Size([")
     assert 0 < float(error[7:-1]) < 1
     assert changed.startswith("[")
     assert seen.endswith("uint8")
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:The number of training batches")
-def test_the_page_of_python_trains(tiny_street, tmp_path, monkeypatch, capsys):
-    """On the street of the other tests, since tracing one takes seconds; README's training is the daily one."""
-    monkeypatch.chdir(tmp_path)
-    (root,) = (word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
-    code, streets = re.subn(
-        r"StreetReader\(StreetSettings\(.*?\)\)", f"DriveStudioReader({root!r})", python_of("python.md")[-1]
-    )
-    code, trainings = re.subn("max_steps=200", "max_steps=3", code)
-    assert (streets, trainings) == (1, 1)
-    with unchecked():
-        exec(code, {"DriveStudioReader": DriveStudioReader})
-    assert "'background': 5000" in capsys.readouterr().out
 
 
 def test_messages_of_the_page_on_troubleshooting_are_those_of_the_program():
@@ -139,22 +123,24 @@ def test_messages_of_the_page_on_troubleshooting_are_those_of_the_program():
             assert part.strip(" ;,:") in source, message
 
 
-README = (Path(__file__).parents[2] / "README.md").read_text()
-
-
 @pytest.mark.filterwarnings("ignore:The number of training batches")
-def test_the_lines_of_python_train_a_street_and_render_it(tiny_street, tmp_path, monkeypatch):
-    """On the street of the other tests, since tracing one takes seconds."""
+@pytest.mark.parametrize("page", ["README.md", pytest.param("docs/python.md", marks=pytest.mark.slow)])
+def test_the_lines_of_python_train_a_street(page, tiny_street, tmp_path, monkeypatch, capsys):
+    """The last of a page, on the street of the other tests, since tracing one takes seconds."""
     monkeypatch.chdir(tmp_path)
-    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.S)
-    assert sum(bool(line) for line in code.splitlines()) == 12
     (root,) = (word.partition("=")[2] for word in tiny_street if word.startswith("data.log.root="))
-    code, streets = re.subn(r"StreetReader\(StreetSettings\(.*?\)\)", f"DriveStudioReader({root!r})", code)
+    code, streets = re.subn(
+        r"StreetReader\(StreetSettings\(.*?\)\)", f"DriveStudioReader({root!r})", python_of(page)[-1]
+    )
     code, trainings = re.subn("max_steps=200", "max_steps=5", code)
     assert (streets, trainings) == (1, 1)
     names: dict[str, Any] = {"DriveStudioReader": DriveStudioReader}
     with unchecked():
         exec(code, names)
-    assert names["image"].shape == (40, 64, 3)
-    assert 0 < float(names["image"].mean()) < 1
-    assert (tmp_path / "mine" / "scene.safetensors").is_file()
+    if page == "README.md":
+        assert sum(bool(line) for line in code.splitlines()) == 12
+        assert names["image"].shape == (40, 64, 3)
+        assert 0 < float(names["image"].mean()) < 1
+        assert (tmp_path / "mine" / "scene.safetensors").is_file()
+    else:
+        assert "'background': 5000" in capsys.readouterr().out

@@ -48,22 +48,19 @@ REFINED = {
     "density__steady_means": False,  # dup_in_optim: zeros for exp_avg and exp_avg_sq
 }
 """What its code does with every node that it refines, and no key says."""
-OBJECTS = REFINED | {"box_points": 0, "density__screen_size_until": at(30_000), "densify_until": at(19_999)}
+OBJECTS = REFINED | {"box_points": 0}
 ALL = {
     "image_points": None,
     "data.log.lidar_ahead": [-2, 80],  # truncated_min_range, truncated_max_range
-    "data.log.extent": "first_pose",
     "optimizer.eps": 1e-15,
     "optimizer.largest_radius": None,
     "optimizer.relative_length": 1.0,
-    "split.with_replacement": True,
     "render.settings.eps2d": 0.3,
     "render.settings.alpha_max": 0.999,  # of gsplat 1.3.0, as the next four
     "render.settings.stop": "exclusive",
     "render.settings.clamp_colors": True,
     "render.settings.detach_directions": True,
     "render.settings.half_colors": False,
-    "render.settings.plain_gradients": False,  # absgrad: True
     "schedule.refine_in.start": at(501),  # warmup_steps 500, exclusive
     "schedule.refine_in.stop": 1.0,
     "schedule.densify_until": at(14_999),  # stop_split_at 15000, exclusive
@@ -72,15 +69,10 @@ ALL = {
     "schedule.pause_after_reset": None,
     "callback.density_control.pause_after_reset": None,
     "callback.density_control.first_counts_all": True,
-    "schedule.sh_interval": at(1_000),
-    "schedule.resolution.double_in": at(250),
     "loss.photometric.weight": 1.0,
-    "loss.photometric.lambda_dssim": 0.2,
-    "loss.sky.floor": None,
     "loss.depth.nearest": 0.01,
     "loss.depth.nearest_rendered": 1e-4,
     "loss.depth.farthest": 80.0,
-    "effects.sky.when": "on",
     "effects.shutter.when": "off",
     "effects.exposure.when": "off",  # its module for every image is the affine map
     "node.background.sources.images.number": 0,
@@ -90,103 +82,55 @@ ALL = {
     **random_points("near"),
     **random_points("far"),
     **per_node("background", **REFINED),
-    "node.background.density.screen_size_until": at(3_999),  # stop_screen_size_at 4000, exclusive
     "node.background.max_gaussians": None,
 }
-CURRENT = {"effects.affine.when": "on"}
-LEGACY = {
-    "effects.affine.when": "off",
-    "loss.dynamic_region.weight": 1.0,  # its factor 5 is ignored
-    "loss.dynamic_region.threshold": 0.2,
-    "loss.dynamic_region.from_progress": at(20_001),  # start_from 20000, exclusive
-}
-RIGID = {
-    "node.background.clear_swept_boxes": True,
-    **per_node("rigid", **OBJECTS),
-    "node.rigid.box_margin": 0.0,
-    "node.rigid.temporal_smooth_of": "frame",
-    "node.rigid.learning_rates.rotation_deltas.initial": 2 * 1e-5,  # of rotation vectors, not of quaternions
-    "node.rigid.learning_rates.rotation_deltas.final": 2 * 5e-6,
-}
+LEGACY = {"effects.affine.when": "off", "loss.dynamic_region.threshold": 0.2}
+RIGID = per_node("rigid", **OBJECTS)
 PEOPLE = {
     "node.smpl.sharp_shape_form": "ratio",
     "node.smpl.density": None,
     "node.smpl.random_colors": True,
-    "node.smpl.temporal_smooth_of": "frame",
     "node.smpl.smoothness_weight": 0.0,
-    "node.smpl.learning_rates.means.initial": pytest.approx(3 * 1.6e-4),
-    "node.smpl.learning_rates.means.final": pytest.approx(3 * 1.6e-6),
-    "node.smpl.learning_rates.rotation_deltas.initial": 2 * 1e-5,
-    "node.smpl.learning_rates.rotation_deltas.final": 2 * 5e-6,
-    "node.smpl.learning_rates.joint_deltas.initial": 2 * 5e-5,
-    "node.smpl.learning_rates.joint_deltas.final": 2 * 1e-5,
 }
 DEFORMABLE = {
     **per_node("deformable", **OBJECTS),
     "node.deformable.refine_boxes": False,
-    "node.deformable.deform_from": at(3_001),  # use_deformgs_after 3000, exclusive
     "node.deformable.network.skip": 5,
-    "node.deformable.learning_rates.means.initial": 2 * 1.6e-4,
-    "node.deformable.learning_rates.means.final": 2 * 1.6e-6,
-    "node.deformable.learning_rates.network.initial": 5 * 1.6e-3,
-    "node.deformable.learning_rates.network.final": 5 * 1.6e-4,
 }
 FIELD = {
-    "node.background.learning_rates.network.initial": 5 * 1.6e-4,
-    "node.background.learning_rates.network.final": 2.53e-5,  # 8e-6 would come at step 40,000
-    "node.background.deform_from": at(3_000),
     "node.background.time_noise": 0.1,
     "node.background.time_noise_until": at(20_000),
     "node.background.reach": None,
     "node.background.network.skip": 5,
     "node.background.network.scales": True,
 }
-SINGLE = {"node.background.clear_swept_boxes": False}
 VIBRATING = {
     "effects.affine.weight": 0.0,  # trainer.losses has no affine
-    "node.background.random_life_peaks": False,
-    "render.settings.plain_gradients": True,
     "schedule.densify_until": at(19_999),
-    "schedule.sh_interval": at(2_000),
-    "schedule.resolution.double_in": at(5_000),
-    "loss.sky.floor": 0.1,
-    "node.background.initial_life_span": pytest.approx(0.1**0.5),
     "node.background.density.cycle": 0.2,
     "node.background.min_factor": 0.05,
     "node.background.max_gaussians": 3_000_000,
 }
 BY_HAND = {
-    ("drivestudio", "3dgs"): ALL | CURRENT | SINGLE,
-    ("drivestudio", "streetgs"): ALL | CURRENT | RIGID,
-    ("drivestudio", "omnire"): ALL | CURRENT | RIGID | PEOPLE | DEFORMABLE | {"node.smpl.volume_weight": 0.0},
-    ("drivestudio", "deformgs"): ALL | CURRENT | SINGLE | FIELD,
-    ("drivestudio", "pvg"): ALL | CURRENT | SINGLE | VIBRATING,
+    ("drivestudio", "3dgs"): ALL,
+    ("drivestudio", "streetgs"): ALL | RIGID,
+    ("drivestudio", "omnire"): ALL | RIGID | PEOPLE | DEFORMABLE | {"node.smpl.volume_weight": 0.0},
+    ("drivestudio", "deformgs"): ALL | FIELD,
+    ("drivestudio", "pvg"): ALL | VIBRATING,
     ("drivestudio_legacy", "streetgs"): ALL | LEGACY | RIGID,
-    ("drivestudio_legacy", "omnire"): ALL
-    | LEGACY
-    | RIGID
-    | PEOPLE
-    | DEFORMABLE
-    | {"node.smpl.volume_from": at(6_001)},  # start_after 6000, exclusive
+    ("drivestudio_legacy", "omnire"): ALL | LEGACY | RIGID | PEOPLE | DEFORMABLE,
 }
-"""Values that upstream has in another form, converted by hand rather than by drivestudio_keys.yaml, and values of its
-code that no key says. ``tests/cli/test_upstream.py`` compares the keys themselves."""
+"""Values of upstream's code that no key says, or that the table of keys lacks."""
+USUAL, FURTHER = ["photometric", "sky", "depth"], ["opacity_entropy", "inverse_depth_smoothness"]
 LOSSES = {
-    "drivestudio": ["photometric", "sky", "depth"],
-    "drivestudio_legacy": [
-        "photometric",
-        "sky",
-        "depth",
-        "opacity_entropy",
-        "inverse_depth_smoothness",
-        "dynamic_region",
-    ],
-    "pvg": ["photometric", "sky", "depth", "opacity_entropy", "inverse_depth_smoothness"],
+    "drivestudio": USUAL,
+    "drivestudio_legacy": [*USUAL, *FURTHER, "dynamic_region"],
+    "pvg": [*USUAL, *FURTHER],
 }
 
 
 @pytest.mark.parametrize(("preset", "method"), PAIRS)
-def test_what_is_of_another_form_or_of_no_key_is_upstreams(preset: str, method: str):
+def test_what_no_key_says_is_upstreams(preset: str, method: str):
     found, expected = flat(preset, method), BY_HAND[preset, method]
     # None: there is none, or it is off.
     there = {key: (found.get(key) or None) if value is None else found[key] for key, value in expected.items()}
@@ -259,10 +203,7 @@ def test_resets_come_at_the_steps_of_upstream():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("preset", "method"),
-    [("drivestudio_legacy", "omnire"), ("drivestudio", "pvg")],
-)
+@pytest.mark.parametrize(("preset", "method"), [("drivestudio_legacy", "omnire"), ("drivestudio", "pvg")])
 def test_a_preset_trains_and_says_what_it_is(preset: str, method: str, run_train, tmp_path, capsys):
     """Every part of it: smaller images first, density control, all terms."""
     few = [f"node.background.sources.{name}.number={number}" for name, number in (("lidar", 600), ("near", 100))]
@@ -294,9 +235,9 @@ def literal(cell: str) -> Any:
         return cell
 
 
-@pytest.mark.parametrize(("preset", "method"), pairs())
+@pytest.mark.parametrize(("preset", "method"), PAIRS)
 def test_our_values_are_those_that_the_preset_composes(preset: str, method: str):
-    cfg = composed(f"preset={preset}", f"method={method}", "schedule=paper", "capacity=paper")
+    cfg = composed(f"preset={preset}", f"method={method}", *FULL)
     flat: dict[str, Any] = dict(flat_config(resolved(cfg)))
     lists = {key: value for key, value in flat.items() if isinstance(value, list)}
     flat |= {f"{key}.{index}": item for key, items in lists.items() for index, item in enumerate(items)}
@@ -312,7 +253,7 @@ def test_our_values_are_those_that_the_preset_composes(preset: str, method: str)
     assert all(any(note in one for note in said) for one in notes)
 
 
-@pytest.mark.parametrize(("preset", "method"), pairs())
+@pytest.mark.parametrize(("preset", "method"), PAIRS)
 def test_every_key_has_one_row_and_every_difference_its_reason(preset: str, method: str):
     rows = [row for row in rows_of(preset, method) if row.verdict != "said"]
     assert len({row.key for row in rows}) == len(rows) > 100

@@ -121,27 +121,21 @@ def without_gpu(monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
-def test_a_device_that_is_there(monkeypatch):
+def test_devices_are_named_and_commands_say_what_asked_for_one(without_gpu, monkeypatch, tmp_path):
     assert device_of("cpu", "this", "") == torch.device("cpu")
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert device_of("cuda:1", "this", "") == torch.device("cuda", 1)
-
-
-def test_any_other_is_refused(without_gpu):
     for name in ("tpu", "mps"):
         with pytest.raises(ValueError, match=f"device must be cpu or cuda, got '{name}'"):
             device_of(name, "this", "")
     with pytest.raises(ValueError, match="this needs a CUDA device and torch sees none: buy one"):
         device_of("cuda", "this", "buy one")
-
-
-def test_commands_say_what_asked_for_it(without_gpu, tmp_path):
     with pytest.raises(ValueError, match=r"device=cuda needs a CUDA device .*: say device=cpu"):
         open_scene(tmp_path, "cuda")
     run = replace(make_run(), device="cuda: NVIDIA H100")
     with pytest.raises(ValueError, match=r"trained on cuda: NVIDIA H100 needs .* another machine's; say device=cpu"):
         _device(run, None)
     assert _device(run, "cpu") == torch.device("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert device_of("cuda:1", "this", "") == torch.device("cuda", 1)
 
 
 @pytest.fixture

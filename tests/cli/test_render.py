@@ -13,22 +13,15 @@ from PIL import Image
 from sparsestreet.cli.commands.render import render
 from sparsestreet.cli.config.compose import load_run_config
 from sparsestreet.export.path import shifted
-from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
-from tests.export.street import stored_street, street_views
+from tests.export.street import stored_street, street_views, write_street
 from tests.typed import there
 
 
 @pytest.fixture
 def run(tmp_path) -> Path:
     """A folder with what a training leaves: a scene and views of 5 frames and 4 cameras; frame 2 is held out."""
-    folder = tmp_path / "run"
-    save_scene(folder / "scene.safetensors", stored_street())
-    views = street_views()
-    write_views(
-        folder / "views.json", [v for v in views if v.frame_index != 2], [v for v in views if v.frame_index == 2]
-    )
-    return folder
+    return write_street(tmp_path / "run")
 
 
 def pictures(folder: Path) -> list[np.ndarray]:

@@ -17,6 +17,7 @@ from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.runs.folder import check_resumed, resumed_overrides
 from sparsestreet.records.costs import COSTS
 from sparsestreet.training.callbacks import RowLedger
+from tests.cli.configurations import left_run
 from tests.cli.conftest import ALL_STAGES, TINY_RIGID
 
 
@@ -42,34 +43,39 @@ SAMPLED = [
 
 
 def stopped_at(step: int, tiny_street: list[str], out: Path, stages: list[str] = ALL_STAGES) -> Path:
-    """A run with these stages that failed in a step."""
+    """A run with these stages that failed inside ``step`` + 1, after its frame was drawn."""
+
+    def fails(self, trainer, *arguments):
+        if trainer.global_step == step:
+            raise RuntimeError("stopped by the test")
+
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RowLedger, "on_train_batch_start", _raises_at(step), raising=False)
+        patch.setattr(RowLedger, "on_train_batch_start", fails, raising=False)
         patch.setenv("HYDRA_FULL_ERROR", "1")
         with pytest.raises(RuntimeError, match="stopped by the test"):
             train([*tiny_street, *stages, f"out={out}"])
     return out
 
 
-@pytest.fixture(scope="module")
-def stopped_early(tiny_street, tmp_path_factory) -> Path:
-    """Inside the mask stage: after a reset, in its pause."""
-    return stopped_at(23, tiny_street, tmp_path_factory.mktemp("stopped") / "run")
-
-
-def test_resume_equals_the_uninterrupted_run_bit_for_bit(finished, stopped_early):
-    goes_on_to_the_same_end(stopped_early, finished)
+def test_resume_equals_the_uninterrupted_run_bit_for_bit(finished, tiny_street, tmp_path):
+    """Stopped inside the mask stage: after a reset, in its pause."""
+    goes_on_to_the_same_end(stopped_at(23, tiny_street, tmp_path / "run"), finished)
 
 
 @pytest.mark.slow
-def test_sampled_masks_go_on_bit_for_bit(tiny_street, tmp_path):
-    """What they draw follows from seed and step; rows go before and after the stop."""
+@pytest.mark.parametrize(
+    ("stages", "step"),
+    [(SAMPLED, 23), (["method=pvg"], 17), (["method=deformgs"], 17)],
+    ids=["sampled masks", "pvg", "deformgs"],
+)
+def test_what_is_drawn_in_a_step_is_drawn_again(stages, step, tiny_street, tmp_path):
+    """Masks, temporal smoothing and noise of time; 17 lies between two refinements, so that statistics go on too."""
     whole = tmp_path / "whole"
-    assert train([*tiny_street, *SAMPLED, f"out={whole}"]) == 0
-    ledger = csv.DictReader((whole / "records" / "counts.csv").read_text().splitlines())
-    removed = {row["step"] for row in ledger if row["reason"] == "mask"}
-    assert {"20", "30"} <= removed
-    goes_on_to_the_same_end(stopped_at(23, tiny_street, tmp_path / "part", SAMPLED), whole)
+    assert train([*tiny_street, *stages, f"out={whole}"]) == 0
+    if stages is SAMPLED:  # rows go before and after the stop
+        ledger = csv.DictReader((whole / "records" / "counts.csv").read_text().splitlines())
+        assert {"20", "30"} <= {row["step"] for row in ledger if row["reason"] == "mask"}
+    goes_on_to_the_same_end(stopped_at(step, tiny_street, tmp_path / "part", stages), whole)
 
 
 def goes_on_to_the_same_end(part: Path, whole: Path) -> None:
@@ -84,35 +90,10 @@ def goes_on_to_the_same_end(part: Path, whole: Path) -> None:
     assert (part / "records" / "counts.csv").read_text() == (whole / "records" / "counts.csv").read_text()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("method", ["pvg", "deformgs"])
-def test_what_a_moving_street_draws_in_a_step_is_drawn_again(method, tiny_street, tmp_path):
-    """Temporal smoothing and noise of time; stopped between two refinements, so that statistics go on too."""
-    parts = tmp_path / "whole", tmp_path / "part"
-    assert train([*tiny_street, f"method={method}", f"out={parts[0]}"]) == 0
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(RowLedger, "on_train_batch_start", _raises_at(17), raising=False)
-        patch.setenv("HYDRA_FULL_ERROR", "1")
-        with pytest.raises(RuntimeError, match="stopped by the test"):
-            train([*tiny_street, f"method={method}", f"out={parts[1]}"])
-    assert train([f"resume={parts[1]}"]) == 0
-    assert_equal(*parts)
-
-
 def curve(run: Path) -> list[dict[str, str]]:
     """The rows of metrics.csv, without what is blank in them."""
     with (run / "curves" / "metrics.csv").open(newline="") as file:
         return [{key: value for key, value in row.items() if value} for row in csv.DictReader(file)]
-
-
-def _raises_at(step: int):
-    """A hook that fails inside step ``step`` + 1, after its frame was drawn."""
-
-    def hook(self, trainer, *arguments):
-        if trainer.global_step == step:
-            raise RuntimeError("stopped by the test")
-
-    return hook
 
 
 @pytest.mark.slow
@@ -165,20 +146,8 @@ def test_what_may_change_when_a_run_goes_on(tmp_path, change, refused):
         check_resumed(config | change, tmp_path)
 
 
-def small_run(folder: Path, *overrides: str) -> Path:
-    """What is asked of a run that goes on: its words and its configuration."""
-    (folder / ".hydra").mkdir(parents=True)
-    (folder / "checkpoints").mkdir()
-    (folder / "checkpoints" / "last.ckpt").touch()
-    OmegaConf.save(list(overrides), folder / ".hydra" / "overrides.yaml")
-    OmegaConf.save(
-        {"seed": 3, "a": {"b": 1}, "out": "x", "trainer": {"precision": 16}}, folder / ".hydra" / "config.yaml"
-    )
-    return folder
-
-
 def test_a_run_goes_on_with_its_own_words_then_those_that_are_given(tmp_path):
-    run = small_run(tmp_path / "run", "seed=3", "out=old", "resume=null", "a.b=1")
+    run = left_run(tmp_path / "run", "seed=3", "out=old", "resume=null", "a.b=1", config={"seed": 3, "a": {"b": 1}})
     own = ["seed=3", "a.b=1"]
     assert resumed_overrides([f"resume={run}", "c=2"]) == [*own, f"resume={run}", "c=2", f"out={run}"]
     checkpoint = run / "checkpoints" / "last.ckpt"

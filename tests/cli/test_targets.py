@@ -3,6 +3,7 @@
 import re
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,7 @@ from sparsestreet.cli.config import targets
 from sparsestreet.cli.config.compose import CONF
 from sparsestreet.cli.config.targets import named_by_conf, open_run_config
 from sparsestreet.cli.runs.folder import resumed_overrides
+from tests.cli.configurations import left_run
 
 
 def attacks(mark: str) -> list[dict[str, Any]]:
@@ -148,14 +150,7 @@ def test_a_part_from_outside_is_imported_where_the_user_trusts_its_module(where,
         open_run_config(run, ("..",))
 
 
-def received(folder: Path, *words: str) -> Path:
-    """A run with a checkpoint, whose words are these."""
-    (folder / "checkpoints").mkdir(parents=True)
-    (folder / "checkpoints" / "last.ckpt").touch()
-    (folder / ".hydra").mkdir()
-    (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(list(words)))
-    (folder / ".hydra" / "config.yaml").write_text("{seed: 0}")
-    return folder
+received = partial(left_run, config={"seed": 0})
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """A street of two nodes, small enough to render in milliseconds, and the views of a log that never was."""
 
 import math
+from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -14,7 +16,8 @@ from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings
 from sparsestreet.scene.nodes.tracked import Rigid, RigidSettings
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.scene.storage import StoredScene
+from sparsestreet.scene.storage import StoredScene, save_scene
+from sparsestreet.scene.views import write_views
 from sparsestreet.types import Camera, View
 
 NUM_FRAMES = 5
@@ -60,6 +63,15 @@ def street_views(width: int = 48, height: int = 32, cameras: tuple[int, ...] = t
         for frame in range(NUM_FRAMES)
         for index in cameras
     ]
+
+
+def write_street(folder: Path, views: Sequence[View] | None = None, frame_rate: float | None = None) -> Path:
+    """Write what a training leaves, a scene and its views, of which those of frame 2 are held out."""
+    save_scene(folder / "scene.safetensors", stored_street())
+    views = street_views() if views is None else views
+    others, held_out = ([view for view in views if (view.frame_index == 2) == held] for held in (False, True))
+    write_views(folder / "views.json", others, held_out, frame_rate=frame_rate)
+    return folder
 
 
 def rig_camera(frame: int, yaw: float, width: int, height: int) -> Camera:

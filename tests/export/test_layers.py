@@ -8,13 +8,11 @@ import torch
 
 from sparsestreet.data.lazy import Sweeps
 from sparsestreet.export.layers import (
-    LAYERS,
     MAX_MILLIMETERS,
     LidarReturns,
     count_images,
     enlarged,
     images_seen,
-    instance_table,
     layer_picture,
     layer_pictures,
     layer_values,
@@ -26,6 +24,7 @@ from sparsestreet.types import Sweep
 from tests.export.street import CAR_ROWS, ROAD_ROWS, stored_street, street_views
 
 VIEW = street_views(cameras=(0,))[1]
+LAYERS = ("rgb", "depth", "alpha", "nodes", "instances")
 
 
 def with_faint(*nodes: str):
@@ -48,16 +47,17 @@ def test_the_values_are_those_of_the_rendering():
     assert (found["depth"][~solid] == 0).all()
     # Rounded to a millimeter.
     np.testing.assert_allclose(found["depth"][solid] / 1000, rendering.depth.numpy()[solid], atol=0.00051)
-
-
-def test_what_is_farther_than_65_meters_says_so():
-    stored = with_faint("rigid")
+    # What is farther than 65 meters says so.
+    far = with_faint("rigid")
     with torch.no_grad():
-        stored.scene.nodes["background"].rows.means[:] = torch.tensor([100.0, 0.0, 1.5])
-        stored.scene.nodes["background"].rows.log_scales[:] = 2.0
-    depth = layer_values(stored, VIEW, ["depth"])["depth"]
-    assert set(np.unique(depth)) <= {0, MAX_MILLIMETERS}
-    assert (depth == MAX_MILLIMETERS).any()
+        far.scene.nodes["background"].rows.means[:] = torch.tensor([100.0, 0.0, 1.5])
+        far.scene.nodes["background"].rows.log_scales[:] = 2.0
+    depth = layer_values(far, VIEW, ["depth"])["depth"]
+    assert set(np.unique(depth)) == {0, MAX_MILLIMETERS}
+    with pytest.raises(ValueError, match="made of a log's returns"):
+        layer_values(stored, VIEW, ["lidar"])
+    with pytest.raises(ValueError, match="call count_images before it is edited"):
+        layer_values(stored, VIEW, ["seen"])
 
 
 def test_a_lone_object_is_where_it_covers_more_than_half():
@@ -87,23 +87,18 @@ def test_the_nearest_of_opaque_objects_is_shown():
 
 
 def test_every_object_has_a_line_in_the_table_also_new_ones():
+    """By its id, also where those before it are gone."""
+    faint, gone = with_faint("background"), {"car": REMOVED, "tram": REMOVED}
+    scene = edited(faint.scene.eval(), Edits(gone, {"second": Added("car")}))
+    ids = layer_values(replace(faint, scene=scene), VIEW, ["instances"])["instances"]
+    assert set(np.unique(ids)) == {0, 3}
     scene = edited(stored_street().scene.eval(), Edits(added={"second": Added("car")}))
     stored = replace(stored_street(), scene=scene)
-    assert [(one.id, one.name, one.node) for one in instance_table(stored)] == [
-        (1, "car", "rigid"), (2, "tram", "rigid"), (3, "second", "second"),
-    ]  # fmt: skip
     found = tables(stored, LAYERS)
     assert found["nodes"] == {"1": "background", "2": "rigid", "3": "second"}
-    assert found["instances"]["3"] == {"name": "second", "class": "", "node": "second"}
+    lines = (("1", "car", "rigid"), ("2", "tram", "rigid"), ("3", "second", "second"))
+    assert found["instances"] == {number: {"name": name, "class": "", "node": node} for number, name, node in lines}
     assert tables(stored, ["rgb"]) == {}
-
-
-def test_a_new_object_has_the_id_of_its_line():
-    stored = with_faint("background")
-    gone = {"car": REMOVED, "tram": REMOVED}
-    scene = edited(stored.scene.eval(), Edits(gone, {"second": Added("car")}))
-    ids = layer_values(replace(stored, scene=scene), VIEW, ["instances"])["instances"]
-    assert set(np.unique(ids)) == {0, 3}
 
 
 def test_pictures_stand_below_each_other():
@@ -219,12 +214,6 @@ def test_more_than_255_images_are_255_and_few_are_dark():
     assert none < few < many == more
 
 
-def test_counts_are_asked_for_before_edits():
-    stored = hidden_road()
-    with pytest.raises(ValueError, match="call count_images before it is edited"):
-        layer_values(stored, FRONT[0], ["seen"])
-
-
 def seen_at(column: float, line: float, depth: float) -> list[float]:
     """The world's point that the view's pinhole has there."""
     camera = VIEW.camera
@@ -284,8 +273,3 @@ def test_dots_grow_with_the_picture_and_the_nearer_one_wins():
     wide = np.zeros((2, 640), np.uint16)
     wide[0, 0] = 1000
     assert np.count_nonzero(layer_picture("lidar", wide, []).any(-1)) == 4
-
-
-def test_without_a_log_it_is_refused():
-    with pytest.raises(ValueError, match="made of a log's returns"):
-        layer_values(stored_street(), VIEW, ["lidar"])

@@ -15,20 +15,16 @@ from PIL import Image
 from sparsestreet.cli.commands.export import export
 from sparsestreet.export.path import recorded
 from sparsestreet.export.recording import recorded_parts
-from sparsestreet.scene.storage import save_scene
 from sparsestreet.scene.views import write_views
 from tests.browser import browser
-from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street, street_views
+from tests.export.street import CAR_ROWS, ROAD_ROWS, TRAM_ROWS, stored_street, street_views, write_street
 
 pytest.importorskip("viser", reason="pages need viser: pip install 'sparsestreet[viewer]'")
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("run")
-    save_scene(folder / "scene.safetensors", stored_street())
-    write_views(folder / "views.json", street_views(cameras=(0, 1)), [], frame_rate=10.0)
-    return folder
+    return write_street(tmp_path_factory.mktemp("run"), street_views(cameras=(0, 1)), frame_rate=10.0)
 
 
 def messages(file: Path) -> list[tuple[float, dict[str, Any]]]:

@@ -33,18 +33,21 @@ def test_recorded_views_are_rigs_in_order_of_time():
     assert {view.time for view in path[3]} == {0.75}
 
 
-def test_a_rig_is_the_views_of_a_frame_though_its_cameras_fire_one_after_the_other():
-    path = recorded([replace(view, time=view.time + 0.02 * view.indices[1]) for view in street_views()])
-    assert [[view.camera_index for view in rig] for rig in path] == [[0, 1, 2, 3]] * NUM_FRAMES
-
-
 def test_seconds_go_with_time_and_a_stamp_with_what_was_recorded():
-    """Frame f at 0.1 f seconds, by cameras that fire 10 ms after one another."""
+    """Frame f at 0.1 f seconds, by cameras that fire 10 ms after one another; a lens stays too."""
+    lens = torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0])
     views = [
-        replace(view, seconds=0.1 * view.indices[0] + 0.01 * view.indices[1], stamp=7 + view.indices[0])
+        replace(
+            view,
+            camera=replace(view.camera, distortion=lens),
+            seconds=0.1 * view.indices[0] + 0.01 * view.indices[1],
+            stamp=7 + view.indices[0],
+        )
         for view in street_views()
     ]
     path = recorded(views)
+    for changed in (shifted(path, 1.0), resampled(path, STEP / 2), resized(path, 20)):
+        assert torch.equal(there(changed[1][0].camera.distortion), lens)
     for rig in (resized(path, 24)[3], shifted(path, 1.5)[3]):
         assert [(view.seconds, view.stamp) for view in rig] == [(view.seconds, 10) for view in path[3]]
     between = resampled(path, STEP / 2)[3]
@@ -52,15 +55,6 @@ def test_seconds_go_with_time_and_a_stamp_with_what_was_recorded():
     assert [view.seconds for view in between] == pytest.approx([0.15, 0.16, 0.17, 0.18], abs=1e-12)
     assert {view.stamp for view in between} == {None}
     assert {view.seconds for view in resampled(recorded(street_views()), STEP / 2)[3]} == {None}
-
-
-def test_an_instant_without_one_of_the_cameras_is_named():
-    path = recorded(street_views()[:-1])
-    with pytest.raises(ValueError, match=r"no camera 3 in frame 4, only \[0, 1, 2\]: choose other cameras or frames"):
-        of_cameras(path, [0, 3])
-    assert len(of_cameras(path, [0, 2])) == NUM_FRAMES
-    with pytest.raises(ValueError, match="got none"):
-        recorded([])
 
 
 def test_a_shift_needs_the_front_camera_all_the_time():
@@ -75,8 +69,16 @@ def test_frames_and_cameras_choose():
     assert [rig[0].frame_index for rig in of_frames(path, slice(None, 2))] == [0, 1]
     assert [rig[0].frame_index for rig in of_frames(path, slice(3, None))] == [3, 4]
     assert [view.camera_index for view in of_cameras(path, [3, 0])[4]] == [3, 0]
+    single = of_frames(path, slice(1, 2))
+    assert resampled(single, 0.01) == single
     with pytest.raises(ValueError, match="frames 7 to 9: the path has 0 to 4"):
         of_frames(path, slice(7, 9))
+    lacking = recorded(street_views()[:-1])
+    with pytest.raises(ValueError, match=r"no camera 3 in frame 4, only \[0, 1, 2\]: choose other cameras or frames"):
+        of_cameras(lacking, [0, 3])
+    assert len(of_cameras(lacking, [0, 2])) == NUM_FRAMES
+    with pytest.raises(ValueError, match="got none"):
+        recorded([])
     with pytest.raises(ValueError, match=r"no camera 5 in frame 0, only \[0, 1, 2, 3\]"):
         of_cameras(path, [0, 5])
 
@@ -141,11 +143,6 @@ def test_pieces_of_a_step_meet_every_recorded_instant(pieces):
     assert len(finer) == 4 * pieces + 1
 
 
-def test_a_single_instant_is_a_path():
-    path = of_frames(recorded(street_views()), slice(1, 2))
-    assert resampled(path, 0.01) == path
-
-
 def test_another_width_shows_the_same():
     path = recorded(street_views(width=48, height=33))
     view, small = path[1][0], resized(path, 20)[1][0]
@@ -162,16 +159,6 @@ def test_another_width_shows_the_same():
     assert small.frame_index == view.frame_index
     with pytest.raises(ValueError, match="at least 1 pixel"):
         resized(path, 0)
-
-
-def test_lens_and_shutter_stay(tmp_path):
-    views = [
-        replace(view, camera=replace(view.camera, distortion=torch.tensor([0.1, 0.0, 0.0, 0.0, 0.0])))
-        for view in street_views()
-    ]
-    path = recorded(views)
-    for changed in (shifted(path, 1.0), resampled(path, STEP / 2), resized(path, 20)):
-        assert torch.equal(there(changed[1][0].camera.distortion), there(views[0].camera.distortion))
 
 
 def test_at_the_logs_own_rate_the_recorded_instants_are_shown():

@@ -26,7 +26,6 @@ from sparsestreet.records.summary import (
     TRAINING,
     ClockRow,
     FrameQuality,
-    GuardCounts,
     Latency,
     MetricSummary,
     NovelRecord,
@@ -72,7 +71,6 @@ def test_summary_round_trip(tmp_path):
     assert SUMMARY.read(tmp_path) == summary
     assert json.loads(path.read_text())["latency"]["clocks"]["frame"]["p90"] == 60.0
     assert json.loads(path.read_text())["by_camera"] == {HELD_OUT: cameras}
-    assert (summary.camera_mean("psnr_near_lidar", "10"), summary.camera_mean("psnr_full", "3")) == (23.5, None)
 
 
 def test_run_description_round_trip(tmp_path):
@@ -83,15 +81,13 @@ def test_run_description_round_trip(tmp_path):
     again = RUN.read(tmp_path / "run")
     assert again == run  # settings with all their digits, ints as ints
     assert [type(value) for value in again.config.values()] == [type(value) for value in run.config.values()]
-
-
-def test_a_summary_holds_the_run_unchanged(tmp_path):
-    summary = make_summary(config={"loss.weight": 0.012345678901})
-    SUMMARY.write(tmp_path, summary)
-    RUN.write(tmp_path, summary.run)
-    entries = json.loads(SUMMARY.path(tmp_path).read_text())["run"]
-    assert entries == json.loads(RUN.path(tmp_path).read_text())
-    assert (entries["format"], entries["label"], entries["sparsify"]) == (2, "plain", "none")
+    # A summary holds it unchanged, and measurements with six digits.
+    SUMMARY.write(tmp_path / "run", dataclasses.replace(make_summary(psnr=25.123456789), run=run))
+    entries = json.loads(SUMMARY.path(tmp_path / "run").read_text())
+    assert entries["run"] == json.loads(RUN.path(tmp_path / "run").read_text())
+    assert (entries["run"]["format"], entries["run"]["label"]) == (2, "streetgs+paper")
+    assert entries["quality"]["held_out"]["psnr_full"]["mean"] == 25.1235
+    assert (significant(1234567.0, "x"), significant(1.23456789e-5, "x")) == (1234570.0, 1.23457e-5)
 
 
 def test_the_main_split_is_the_held_out_one_where_there_is_one():
@@ -137,14 +133,6 @@ def test_another_format_is_named_before_its_keys(tmp_path, file, value, remedy):
         file.read(tmp_path)
 
 
-def test_floats_are_written_with_six_digits(tmp_path):
-    summary = make_summary(psnr=25.123456789)
-    SUMMARY.write(tmp_path, summary)
-    assert '"mean": 25.1235,' in SUMMARY.path(tmp_path).read_text()
-    assert significant(1234567.0, "x") == 1234570.0
-    assert significant(1.23456789e-5, "x") == 1.23457e-5
-
-
 def test_quality_round_trip_and_plain_csv(tmp_path):
     quality = QUALITY[HELD_OUT]
     quality.write(tmp_path, IMAGES)
@@ -175,18 +163,6 @@ def test_no_record_holds_a_number_that_is_none(tmp_path, value):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_totals_must_be_the_sum_of_their_parts():
-    with pytest.raises(ValueError, match="gaussians_total is 5, its parts sum to 1200"):
-        dataclasses.replace(make_summary(), gaussians_total=5)
-
-
-def test_alarms_are_among_the_guards():
-    with pytest.raises(ValueError, match="alarms holds vanished: 3, rows has None: evaluate again"):
-        GuardCounts({"drawn": 5}, {"vanished": 3})
-    with pytest.raises(ValueError, match="alarms holds vanished: 0, rows has 0"):
-        GuardCounts({"vanished": 0}, {"vanished": 0})
-
-
 def drop(entries, key):
     del entries[key]
 
@@ -198,6 +174,11 @@ def drop(entries, key):
         (lambda entries: entries.update(extra=1), r"unknown keys \['extra'\]"),
         (lambda entries: entries["images"].update(held_out="six"), r"images: held_out: expected int, got str 'six'"),
         (lambda entries: entries["images"].update(held_out=True), r"images: held_out: expected int, got bool"),
+        (lambda entries: entries.update(gaussians_total=5), r"gaussians_total is 5, its parts sum to 1200"),
+        (
+            lambda entries: entries["guards"].update(rows={"vanished": 0}, alarms={"vanished": 0}),
+            r"alarms holds vanished: 0, rows has 0: evaluate again",
+        ),
         (
             lambda entries: entries["latency"]["clocks"]["rig"].update(p50=None),
             r"latency: clocks: rig: p50: expected float, got NoneType",
@@ -207,21 +188,14 @@ def drop(entries, key):
         (lambda entries: entries["run"]["noise"].update(quiet=1), r"noise: quiet: expected bool"),
         (lambda entries: entries.update(resolutions=[64]), r"resolutions\[0\]: expected str, got int 64"),
         (
-            lambda entries: entries["quality"]["held_out"]["psnr_full"].update(images=1.5),
-            r"psnr_full: images: expected int",
-        ),
-        (
             lambda entries: entries["by_camera"]["held_out"]["0"].update(psnr_full="25"),
             r"by_camera: held_out: 0: psnr_full: expected float, got str '25'",
         ),
-        (lambda entries: drop(entries, "by_camera"), r"lacks the keys \['by_camera'\]"),
         (lambda entries: entries.update(bytes_total=1), r"bytes_total is 1"),
         (lambda entries: entries.update(format=99), r"format 99, this version reads 4"),
         (lambda entries: entries["run"].update(format=99), r"run: the record has format 99, .* train the run again"),
         (lambda entries: entries["run"]["config"].update(a={}), r"run: config: a: expected one of bool, .* got dict"),
-        (lambda entries: entries["run"].update(training_seconds="1"), r"training_seconds: expected float, got str '1'"),
         (lambda entries: entries["guards"]["alarms"].update(vanished=1), r"alarms holds vanished: 1, rows has N"),
-        (lambda entries: drop(entries["guards"], "alarms"), r"guards: GuardCounts lacks the keys \['alarms'\]"),
         (lambda entries: entries["evaluated"].update(machine=[]), r"evaluated: machine: expected dict, got list"),
         (lambda entries: entries["run"].update(seed=float("nan")), r"is not strict JSON \(NaN"),
     ],
@@ -241,8 +215,6 @@ def test_a_broken_summary_names_the_file(tmp_path, text):
     write_atomically(SUMMARY.path(tmp_path), text)
     with pytest.raises(RecordError, match=r"summary\.json"):
         SUMMARY.read(tmp_path)
-    with pytest.raises(RecordError, match=r"absent/records/summary\.json: cannot be read"):
-        SUMMARY.read(tmp_path / "absent")
 
 
 @pytest.mark.parametrize(
@@ -260,14 +232,6 @@ def test_a_malformed_quality_names_file_and_line(tmp_path, line, message):
     path.write_text(path.read_text() + line + "\n")
     with pytest.raises(RecordError, match=r"quality\.csv, " + message):
         QUALITY[HELD_OUT].read(tmp_path)
-
-
-def test_quality_with_another_header_is_refused(tmp_path):
-    write_atomically(QUALITY[HELD_OUT].path(tmp_path), "frame,psnr\n0,20\n")
-    with pytest.raises(RecordError, match=r"quality\.csv: the header .* evaluate the run again"):
-        QUALITY[HELD_OUT].read(tmp_path)
-    with pytest.raises(RecordError, match=r"quality_train\.csv: does not exist; evaluate the run first"):
-        QUALITY[TRAINING].read(tmp_path)
 
 
 def test_a_crash_while_writing_leaves_the_old_file_alone(tmp_path, monkeypatch):
@@ -318,15 +282,11 @@ TABLES = [
 
 @pytest.mark.parametrize(("file", "name", "rows", "text"), TABLES, ids=[name for _, name, _, _ in TABLES])
 def test_a_table_is_read_as_it_was_written(tmp_path, file, name, rows, text):
+    """And a cell that is no number is named."""
     file.write(tmp_path, rows)
     assert file.path(tmp_path) == tmp_path / name
     assert (tmp_path / name).read_text() == text
     assert file.read(tmp_path) == rows
-
-
-@pytest.mark.parametrize(("file", "name", "rows", "text"), TABLES, ids=[name for _, name, _, _ in TABLES])
-def test_a_cell_that_is_no_number_is_named(tmp_path, file, name, rows, text):
-    file.write(tmp_path, rows)
     header, first = text.splitlines()[:2]
     number = next(cell for cell in first.split(",") if cell.replace(".", "").isdigit())
     (tmp_path / name).write_text(f"{header}\n{first.replace(number, 'soon', 1)}\n")

@@ -21,6 +21,11 @@ def test_collect_finds_each_run_once(tmp_path):
 
 
 def test_collect_names_what_is_wrong(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nosuch is not there: name a folder of runs"):
+        collect([tmp_path / "nosuch"])
+    (tmp_path / "a.txt").touch()
+    with pytest.raises(FileNotFoundError, match=r"a\.txt is a file: name a folder of runs"):
+        collect([tmp_path / "a.txt"])
     with pytest.raises(FileNotFoundError, match=r"holds no records/summary\.json"):
         collect([tmp_path])
     SUMMARY.write(tmp_path / "good", make_summary())
@@ -36,13 +41,3 @@ def test_a_report_imports_no_torch():
     """What import contracts cannot see: imports inside of functions, and the command."""
     code = "import sys, sparsestreet.cli.commands.report; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-def test_a_folder_that_is_not_there_has_no_runs_to_train(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nosuch is not there: name a folder of runs"):
-        collect([tmp_path / "nosuch"])
-    (tmp_path / "a.txt").touch()
-    with pytest.raises(FileNotFoundError, match=r"a\.txt is a file: name a folder of runs"):
-        collect([tmp_path / "a.txt"])
-    with pytest.raises(FileNotFoundError, match=r"holds no records/summary\.json"):
-        collect([tmp_path])

@@ -11,7 +11,7 @@ from sparsestreet.records.costs import EffectGain, update_costs
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
 from sparsestreet.records.run import EffectDecision, RunDescription
 from sparsestreet.records.summary import PRESETS, PresetRecord, RenderedAs
-from sparsestreet.report.collect import RunRecord, collect, shifts_of
+from sparsestreet.report.collect import RunRecord, collect
 from sparsestreet.report.costs import (
     TRUTH,
     QualityCurve,
@@ -67,11 +67,8 @@ def test_every_column_has_a_number_of_its_own(tmp_path):
     ]
     assert {cell.runs for cell in row} == {("run0", "run1")}
     assert len(grid.notes) == 1
-
-
-def test_a_run_without_pruning_has_spent_no_seconds_on_it(tmp_path):
-    update_costs(tmp_path, phases={"train": 9.0})
-    grid = what_variants_cost(variants([RunRecord(tmp_path, make_summary("m"))]))
+    update_costs(tmp_path / "plain", phases={"train": 9.0})  # a run without pruning has spent no seconds on it
+    grid = what_variants_cost(variants([RunRecord(tmp_path / "plain", make_summary("m"))]))
     assert dict(zip(grid.header, (cell.text for cell in grid.rows[0]), strict=True))["seconds", "pruning"] == "0.0"
 
 
@@ -110,13 +107,10 @@ def test_predictions_stand_beside_measurements(tmp_path):
     ]
 
 
-def test_repeats_may_decide_otherwise(tmp_path):
+def test_repeats_may_decide_otherwise_and_older_records_say_nothing(tmp_path):
     runs = [RunRecord(tmp_path / str(seed), planned(seed, replace(LENS, on=bool(seed)))) for seed in (0, 1)]
     (row,) = what_effects_cost(variants(runs)).rows
     assert row[2].text == "on in 1 of 2"
-
-
-def test_records_without_a_plan_give_no_row(tmp_path):
     assert what_effects_cost(variants([RunRecord(tmp_path, make_summary("m"))])).rows == ()
 
 
@@ -157,21 +151,6 @@ def test_none_recorded_no_table(tmp_path, table):
     assert table(variants(collect([write_sweep(tmp_path, curves=False)]))) is None
 
 
-def test_both_sides_count_alike(tmp_path):
-    write_beside(tmp_path, {1.0: 40.0, -1.0: 44.0, 2.0: 60.0}, psnr=20.0)
-    true = TRUTH["psnr_full"]
-    assert shifts_of(tmp_path) == {1.0: {"fid": 42.0, true: 20.0}, 2.0: {"fid": 60.0, true: 20.0}}
-
-
-def test_an_arm_is_the_mean_of_its_scenes(tmp_path):
-    sweep = write_sweep(tmp_path)
-    for seed in range(3):
-        write_beside(sweep / f"streetgs_seed{seed}", {1.0: 40.0 + seed, -1.0: 40.0 + seed})
-    grid = beside_the_path(variants(collect([sweep])))
-    assert grid.header == (("", "arm"), ("fid", "1 m"))
-    assert [row[1].text for row in grid.rows] == ["41", "-", "-"]
-
-
 @pytest.mark.parametrize("seeds", [(0, 1), (0, 0)])
 def test_a_scene_is_the_mean_of_its_runs(tmp_path, seeds):
     """Of other seeds and of one and the same."""
@@ -194,13 +173,17 @@ def test_runs_on_all_views_are_in_no_mean_with_the_others(tmp_path, splits, dist
     assert [row[1].text for row in beside_the_path(variants(runs)).rows] == [distance]
 
 
-def test_the_truth_comes_before_distances(tmp_path):
+def test_the_truth_comes_before_distances_and_both_sides_count_alike(tmp_path):
+    """Of three scenes two have a record; the other arms have none."""
     sweep = write_sweep(tmp_path)
-    write_beside(sweep / "streetgs_seed0", {1.0: 41.25, -1.0: 41.25, 2.0: 50.0}, name="a_distance", psnr=20.4)
+    for seed in (0, 1):
+        distances = {1.0: 40.25 + 10 * seed, -1.0: 42.25 + 10 * seed, 2.0: 50.0}
+        write_beside(sweep / f"streetgs_seed{seed}", distances, name="a_distance", psnr=20.4 + seed)
     grid = beside_the_path(variants(collect([sweep])))
     names = [TRUTH["psnr_full"]] * 2 + ["a_distance"] * 2
-    assert grid.header[1:] == tuple(zip(names, ["1 m", "2 m"] * 2, strict=True))
-    assert [cell.text for cell in grid.rows[0][1:]] == ["20.40", "20.40", "41.25", "50"]
+    assert grid.header == (("", "arm"), *zip(names, ["1 m", "2 m"] * 2, strict=True))
+    assert [cell.text for cell in grid.rows[0][1:]] == ["20.90", "20.90", "46.25", "50"]
+    assert {cell.text for row in grid.rows[1:] for cell in row[1:]} == {"-"}
 
 
 def test_table_4_holds_the_inception_distance_alone(tmp_path):
@@ -301,9 +284,7 @@ def test_every_column_is_its_own(tmp_path, protocol):
 
 def test_a_machine_that_was_not_quiet_while_it_rendered_is_named(tmp_path):
     write_rendered(tmp_path, 0.1)
-    path = PRESETS.path(tmp_path)
     PRESETS.write(tmp_path, replace(PRESETS.read(tmp_path), noise=replace(NOISE, quiet=False)))
-    assert path.is_file()
     grid = rendered_otherwise(variants([record(make_summary("m"), str(tmp_path))]), DRIVESTUDIO)
     assert grid.notes[-1] == "§ times of a machine that was not quiet, compared with no other: m"
     assert [row[-1].text for row in grid.rows] == ["20.00 §", "12.00 §"]

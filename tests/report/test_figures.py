@@ -14,15 +14,12 @@ from matplotlib.figure import Figure
 from sparsestreet.metrics.definitions import DRIVESTUDIO, STRICT
 from sparsestreet.records.costs import NodeCost, update_costs
 from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, PRUNING, CountChange, HeldOutLook
-from sparsestreet.records.strict_json import RecordError
 from sparsestreet.report import figures
 from sparsestreet.report.collect import collect
 from sparsestreet.report.figures import (
     COLORS,
     GREY,
     PARETO_COSTS,
-    _counts,
-    _frame_costs,
     _paint,
     counts_over_time,
     frame_waterfall,
@@ -95,51 +92,12 @@ def test_ink_is_the_pages_and_names_are_not_shared(found, tmp_path):
     assert (tmp_path / "once" / "again" / "a.svg").read_text() == one
 
 
-def test_a_bar_is_the_mean_over_runs(tmp_path):
-    runs = []
-    for seed, ms in enumerate((1.0, 4.0)):
-        update_costs(tmp_path / str(seed), nodes={"rigid": NodeCost(10, 0.1, 4.0, ms)}, effects={"sky": 2 * ms})
-        runs.append(record(make_summary("plain", seed), str(tmp_path / str(seed))))
-    (variant,) = variants(runs)
-    assert _frame_costs(variant) == {"rigid": 2.5, "effect: sky": 5.0}
-
-
-def test_counts_are_of_all_nodes(tmp_path):
-    """100 and 20 Gaussians, of which pruning leaves 30 and 20."""
-    starts = [CountChange(0, name, 0, rows, "start") for name, rows in (("background", 100), ("rigid", 20))]
-    LEDGER.write(tmp_path, [*starts, CountChange(5, "background", 100, 30, PRUNING)])
-    axes = Figure().subplots()
-    (variant,) = variants([record(make_summary("plain"))])
-    _counts(axes, styles([variant])[variant.name], tmp_path)
-    line, dots = ([np.asarray(values).tolist() for values in drawn.get_data()] for drawn in axes.get_lines())
-    assert (line, dots) == ([[0, 5], [120, 50]], [[5], [50]])
-
-
 def test_a_figure_of_an_earlier_report_goes(tmp_path):
     """Where the records no longer hold what it shows."""
     for name in ("pareto_frame", "held_out", "counts", "waterfall", "of_somebody_else"):
         (tmp_path / f"{name}.svg").write_text("<svg/>")
     assert _figures([], DRIVESTUDIO, tmp_path)[0] == []
     assert [path.name for path in tmp_path.iterdir()] == ["of_somebody_else.svg"]
-
-
-def test_every_run_has_a_line(tmp_path, monkeypatch):
-    """Two of one scene and seed have two."""
-    runs = []
-    for name in "ab":
-        HELD_OUT_CURVE.write(tmp_path / name, [HeldOutLook(10.0, 9, 20.0, None, None)])
-        runs.append(record(make_summary("plain"), str(tmp_path / name)))
-    drawn = []
-    monkeypatch.setattr(figures, "write_svg", lambda figure, path, says=None: drawn.append(figure))
-    assert held_out_over_time(variants(runs), tmp_path / "some.svg")
-    assert len(drawn[0].axes[0].get_lines()) == 2
-
-
-def test_costs_of_another_format_are_named(found, tmp_path):
-    path = found[0].records[0].folder / "records" / "cost.json"
-    path.write_text("{}")
-    with pytest.raises(RecordError, match=r"cost\.json: .*has format None"):
-        frame_waterfall(found, tmp_path / "some.svg")
 
 
 @pytest.fixture
@@ -239,12 +197,15 @@ def test_a_figure_of_one_region_or_none(canvas, tmp_path):
 
 
 def test_bars_of_a_frame_lie_behind_each_other(canvas, tmp_path):
-    """Each variant has a row, each part a color; an effect is hatched."""
-    parts = {"a": (3.0, 1.0, 0.5), "a+paper": (1.5, 0.25, 0.75)}
+    """Each variant has a row, each part a color, as wide as the mean over its runs; an effect is hatched."""
+    parts, runs = {"a": (3.0, 1.0, 0.5), "a+paper": (1.5, 0.25, 0.75)}, []
     for name, (road, cars, sky) in parts.items():
-        nodes = {node: NodeCost(10, 0.1, 4.0, ms) for node, ms in (("road", road), ("cars", cars))}
-        update_costs(tmp_path / name, nodes=nodes, effects={"sky": sky})
-    found = variants([record(make_summary(name), str(tmp_path / name)) for name in parts])
+        for seed, less in enumerate((0.125, -0.125)):
+            folder = tmp_path / f"{name}{seed}"
+            nodes = {node: NodeCost(10, 0.1, 4.0, ms - less) for node, ms in (("road", road), ("cars", cars))}
+            update_costs(folder, nodes=nodes, effects={"sky": sky - less})
+            runs.append(record(make_summary(name, seed), str(folder)))
+    found = variants(runs)
     assert frame_waterfall(found, tmp_path / "w.svg")
     (axes,) = canvas["w.svg"].axes
     bars = [
@@ -267,30 +228,38 @@ def test_bars_of_a_frame_lie_behind_each_other(canvas, tmp_path):
 
 
 def test_a_curve_is_the_runs_own(canvas, tmp_path):
-    """A panel a method; colors and dashes tell sparsifications apart, controls are gray."""
+    """A panel a method, two runs of one seed in the first; colors and dashes tell sparsifications apart, controls are
+    gray. Counts are of all nodes: one is pruned to 50 of 100 Gaussians and more, the other keeps its 7."""
     runs = []
-    for place, name in enumerate(("a", "a+paper", "a+capped", "b")):
-        folder = tmp_path / name
+    for place, name in enumerate(("a", "a", "a+paper", "a+capped", "b")):
+        folder = tmp_path / str(place)
         HELD_OUT_CURVE.write(folder, [HeldOutLook(10.0 + place, 9, 20.0 + place, 1.0, 2.0),
                                       HeldOutLook(30.0 + place, 19, 25.0 - place, 1.0, 2.0)])  # fmt: skip
         rows = 100 * (place + 1)
-        LEDGER.write(folder, [CountChange(0, "x", 0, rows, "start"), CountChange(5, "x", rows, 50, PRUNING)])
+        starts = [CountChange(0, node, 0, count, "start") for node, count in (("x", rows), ("y", 7))]
+        LEDGER.write(folder, [*starts, CountChange(5, "x", rows, 50, PRUNING)])
         runs.append(record(make_summary(name), str(folder)))
     found = variants(runs)
     for draw, x_label, y_label, drawn in (
         (held_out_over_time, "training seconds", "held-out PSNR, dB",
-         [([10.0 + place, 30.0 + place], [20.0 + place, 25.0 - place]) for place in range(4)]),
-        (counts_over_time, "step", "Gaussians", [([0, 5], [100 * (place + 1), 50]) for place in range(4)]),
+         [([10.0 + place, 30.0 + place], [20.0 + place, 25.0 - place]) for place in range(5)]),
+        (counts_over_time, "step", "Gaussians", [([0, 5], [100 * (place + 1) + 7, 57]) for place in range(5)]),
     ):  # fmt: skip
         assert draw(found, tmp_path / "c.svg")
         one, other = canvas["c.svg"].axes
         assert [(axes.get_title(), axes.get_xlabel()) for axes in (one, other)] == [("a", x_label), ("b", x_label)]
         assert [axes.get_ylabel() for axes in (one, other)] == [y_label, ""]
-        lines = [line for axes in (one, other) for line in axes.get_lines() if line.get_linestyle() != "None"]
+        lines, dots = [], []
+        for line in (*one.get_lines(), *other.get_lines()):
+            (dots if line.get_linestyle() == "None" else lines).append(line)
         assert [tuple(np.asarray(part).tolist() for part in line.get_data()) for line in lines] == drawn
+        pruned = [([5], [57])] * 5 if draw is counts_over_time else []
+        assert [tuple(np.asarray(part).tolist() for part in line.get_data()) for line in dots] == pruned
         looks = [(line.get_label(), line.get_color(), line.get_linestyle()) for line in lines]
         assert looks == [
-            *(("plain", COLORS[0], "-"), ("paper", COLORS[1], "-"), ("control: capped", GREY, ":")),
+            *[("plain", COLORS[0], "-")] * 2,
+            ("paper", COLORS[1], "-"),
+            ("control: capped", GREY, ":"),
             ("plain", COLORS[0], "-"),
         ]
         legends = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in (one, other)]

@@ -63,23 +63,13 @@ def test_rows_hold_mean_spread_and_number_of_runs():
     assert [row.runs for row in section.rows] == ["n=2 (seed 0,1)"] * 3
 
 
-def test_only_shared_seeds_are_paired():
-    (section,) = sections(
-        records(make_summary("plain", 0), make_summary("ours", 1), make_summary("mask", 0, psnr=26.0)), "plain"
-    )
+def test_only_shared_seeds_are_paired_and_runs_of_one_seed_count_as_their_mean():
+    twice = [make_summary("ours", 0, psnr=psnr) for psnr in (25.5, 26.5)]
+    (section,) = sections(records(make_summary("plain", 0), *twice, make_summary("mask", 1)), "plain")
     rows = by_label(section)
-    assert rows["ours against plain"].cells[0] is None
-    assert rows["ours against plain"].runs == "no shared seed"
-    assert rows["mask against plain"].cells[0] == Spread(1.0, None, 1)
-
-
-def test_runs_of_one_seed_count_as_their_mean_in_a_pair():
-    (section,) = sections(
-        records(make_summary("plain", 0), make_summary("ours", 0, psnr=25.5), make_summary("ours", 0, psnr=26.5)),
-        "plain",
-    )
-    assert section.rows[1].runs == "n=2 (seed 0,0)"
-    assert section.rows[2].cells[0] == Spread(1.0, None, 1)
+    assert rows["ours"].runs == "n=2 (seed 0,0)"
+    assert rows["ours against plain"].cells[0] == Spread(1.0, None, 1)
+    assert (rows["mask against plain"].cells[0], rows["mask against plain"].runs) == (None, "no shared seed")
 
 
 def test_a_difference_needs_a_number_to_be_a_share_of():
@@ -160,13 +150,15 @@ def test_no_mean_over_scenes_of_one_scene_or_of_different_configurations():
     assert not any(section.over_scenes for section in sections(records(*apart)))
 
 
-def test_a_mean_over_scenes_takes_clips_of_any_length():
+def test_a_mean_over_scenes_takes_clips_of_any_length_and_who_has_several():
+    """One camera each is one camera still, which has no table of its own."""
     clips = [
         make_summary("m", config={"data.log.last_frame": last}, scene=scene) for last, scene in ((9, "a"), (7, "b"))
     ]
-    mean = sections(records(*clips))[-1]
-    assert mean.over_scenes
-    assert mean.rows[0].runs == "2 scenes, n=2"
+    found = sections(records(*clips, make_summary("other", scene="a")))
+    assert not any(section.by_camera for section in found)
+    assert found[-1].over_scenes
+    assert [(row.label, row.runs) for row in found[-1].rows] == [("m", "2 scenes, n=2")]
 
 
 def test_each_clip_of_a_log_counts_once_in_a_difference():
@@ -179,11 +171,6 @@ def test_each_clip_of_a_log_counts_once_in_a_difference():
     ]
     difference = sections(records(*runs), "plain")[-1].rows[-1]
     assert (difference.runs, difference.cells[0].mean) == ("3 scenes, n=3", pytest.approx(-3.0))
-
-
-def test_a_mean_over_scenes_leaves_out_who_has_one_scene_only():
-    runs = [make_summary("m", scene="a"), make_summary("m", scene="b"), make_summary("other", scene="a")]
-    assert [row.label for row in sections(records(*runs))[-1].rows] == ["m"]
 
 
 def test_runs_without_held_out_views_show_their_training_views():
@@ -232,12 +219,6 @@ def test_several_cameras_get_a_table_of_their_own():
     )
 
 
-def test_one_camera_gets_no_table_of_its_own():
-    """Over scenes several logs of one camera each are one camera still."""
-    found = sections(records(make_summary(scene="a"), make_summary(scene="b")))
-    assert [(section.over_scenes, section.by_camera) for section in found] == 2 * [(False, False)] + [(True, False)]
-
-
 def test_cameras_have_means_over_scenes():
     found = sections(records(*(rig((psnr, 28.0, 22.0), 24.0, scene=name) for name, psnr in (("a", 24.0), ("b", 26.0)))))
     assert [(section.over_scenes, section.by_camera) for section in found[-2:]] == [(True, False), (True, True)]
@@ -255,11 +236,6 @@ def test_the_baseline_may_be_the_name_of_a_column():
         sections(records(*BOTH), "m")
     with pytest.raises(ValueError, match=r"no run has the baseline 'none': choose one of \['m x=1', 'm x=2'\]"):
         sections(records(*BOTH), "none")
-
-
-def test_nothing_is_said_of_differences_where_there_are_none():
-    (section,) = sections(records(make_summary()), "plain")
-    assert not [note for note in section.notes if "differences" in note]
 
 
 def test_a_label_is_a_baseline_in_tables_where_it_has_one_configuration():
@@ -338,25 +314,27 @@ def test_a_table_by_camera_has_rows_of_cameras():
     assert printed_text.count("runs ") == 2
 
 
-def test_a_single_run_says_so_and_has_no_spread():
-    text = text_of(PLAIN_AND_OURS[:1])
-    assert "| plain | n=1 (seed 0) | 25.00 |" in text
-    assert "n=1 has no spread" in text
-
-
 def test_cells_of_fewer_runs_than_the_row_carry_their_number():
+    alone = text_of(PLAIN_AND_OURS[:1], "plain")
+    assert "| plain | n=1 (seed 0) | 25.00 |" in alone
+    assert "n=1 has no spread" in alone
+    assert "differences" not in alone
     assert "22.00 (n=1)" in text_of(records(make_summary(seed=0), make_summary(seed=1, vehicle_psnr=None)))
     assert "| - |" in text_of(records(make_summary(), make_summary("ours", vehicle_psnr=None)))
 
 
-def test_counts_that_a_cap_held_down_are_marked():
-    capped = make_summary("streetgs", caps={"background": 1000})
-    text = text_of(records(capped, make_summary("streetgs+paper")), "streetgs")
+def test_counts_that_a_cap_held_down_are_marked_and_named():
+    capped = make_summary("streetgs", caps={"background": 130_000, "rigid": 8000})
+    text = text_of(records(capped, make_summary("streetgs", 1), make_summary("streetgs+paper")), "streetgs")
     plain, paper, difference = (line for line in text.splitlines() if line.startswith("| streetgs"))
     assert plain.count("†") == difference.count("†") == 3  # the total and two nodes, nothing else
-    assert "1,200 †" in plain
+    assert "1,200 ± 0 †" in plain
     assert "100.0 % †" in difference
     assert "†" not in paper
+    said = "† streetgs: background reached its cap of 130,000 Gaussians, rigid reached its cap of 8,000 Gaussians"
+    assert f"- {said}\n" in text
+    (section,) = sections(records(make_summary("streetgs"), make_summary("a", caps={"rigid": 5})), "streetgs")
+    assert [row.capped for row in section.rows] == [False, True, True]
 
 
 def printed(found, width, baseline=None):
@@ -497,17 +475,6 @@ def test_commits_and_uncommitted_changes_are_named():
     assert "some runs were measured by code with uncommitted changes" in notes(measured)
     measured = make_summary(evaluated=Evaluation("e", MACHINE, NEWER, "cpu: test", 2))
     assert note("runs were measured by different", make_summary(), measured)
-
-
-def test_caps_are_named_and_mark_what_they_hold_down():
-    capped = make_summary("streetgs", caps={"background": 130_000, "rigid": 8000})
-    free = make_summary("streetgs+paper")
-    expected = "† streetgs: background reached its cap of 130,000 Gaussians, rigid reached its cap of 8,000 Gaussians"
-    assert expected in notes(capped, free, make_summary("streetgs", 1))
-    (section,) = sections(records(capped, free), "streetgs")
-    assert [row.capped for row in section.rows] == [True, False, True]
-    (section,) = sections(records(make_summary("streetgs"), make_summary("a", caps={"rigid": 5})), "streetgs")
-    assert [row.capped for row in section.rows] == [False, True, True]
 
 
 def test_the_same_run_twice_is_no_repeat():

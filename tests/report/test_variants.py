@@ -186,21 +186,6 @@ def test_a_sparsification_says_itself_that_it_is_a_control():
     assert found == {"streetgs": None, "streetgs+size": "as many Gaussians, the smallest"} | known
 
 
-def test_each_scene_counts_once():
-    runs = [
-        make_summary("plain", 0, 20.0, scene="a"),
-        make_summary("plain", 1, 22.0, scene="a"),
-        make_summary("plain", 0, 30.0, scene="b"),
-    ]
-    (variant,) = variants([record(run) for run in runs])
-    assert variant.mean(PSNR) == 25.5
-
-
-def test_several_runs_of_one_seed_are_their_mean():
-    (variant,) = variants([record(make_summary("plain", 0, psnr)) for psnr in (20.0, 23.0)])
-    assert variant.units(PSNR).tolist() == [21.5]
-
-
 def test_two_parts_of_one_log_are_two_scenes():
     """Each part is paired with itself: 20 with 19 and 30 with 28."""
     parts = [{"data.log.first_frame": first, "data.log.last_frame": first + 9} for first in (0, 10)]
@@ -271,6 +256,13 @@ def test_runs_on_all_views_stand_apart():
     (variant,) = variants([record(held), record(whole)])
     assert variant.units(PSNR).tolist() == [20.0]
     assert variant.units("training psnr_full", whole=True).tolist() == [28.0]
+
+
+def test_each_scene_and_each_seed_counts_once():
+    runs = [("a", 0, 20.0), ("a", 0, 23.0), ("a", 1, 22.5), ("b", 0, 30.0)]
+    (variant,) = variants([record(make_summary("plain", seed, psnr, scene=scene)) for scene, seed, psnr in runs])
+    assert sorted(variant.units(PSNR)) == [21.5, 22.5, 30.0]
+    assert variant.mean(PSNR) == 26.0
 
 
 def test_data_that_differ_under_one_name_stand_apart():

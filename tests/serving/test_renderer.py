@@ -1,6 +1,8 @@
 """Requests as pictures, without a network."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -146,77 +148,38 @@ def test_bytes_are_a_png_or_a_jpeg(street):
 NAN = float("nan")
 
 
-def _nan_pose(request):
-    request.sensor_pose.start_pose.vec.x = NAN
+def put(path: str, *values: float) -> Callable[[Any], None]:
+    """Set an entry of a request, or several that end alike: ``resolution_w,resolution_h``, ``radial_coeffs.4``."""
+    *parents, last = path.split(".")
+
+    def change(request: Any) -> None:
+        for name in parents:
+            request = getattr(request, name)
+        for name, value in zip(last.split(","), values, strict=True):
+            request.__setitem__(int(name), value) if name.isdigit() else setattr(request, name, value)
+
+    return change
 
 
-def _no_rotation(request):
-    request.sensor_pose.start_pose.quat.Clear()
-
-
-def _backward(request):
-    request.frame_end_us = request.frame_start_us - 1
-
-
-def _other_clock(request):
-    request.frame_start_us = request.frame_end_us = 5
-
-
-def _million(request):
-    request.resolution_w = 10**6
-
-
-def _too_many(request):
-    request.resolution_w = request.resolution_h = 8000
-
-
-def _no_lens(request):
-    request.camera_intrinsics.ClearField("opencv_pinhole_param")
-
-
-def _flat(request):
-    request.camera_intrinsics.opencv_pinhole_param.focal_length_x = 1e-30
-
-
-def _folded(request):
-    request.camera_intrinsics.opencv_pinhole_param.tangential_coeffs[0] = 5.0
-
-
-def _twice(request):
-    for _ in range(2):
-        place(request, "car", at(0, 0, 0))
-
-
-def _stranger(request):
-    place(request, "caar", at(0, 0, 0))
-
-
-def _nan_actor(request):
-    place(request, "car", at(NAN, 0, 0))
-
-
-def _far(request):
-    request.sensor_pose.start_pose.vec.x = 1e9
-
-
+LENS, POSE = "camera_intrinsics.opencv_pinhole_param", "sensor_pose.start_pose"
 BAD = {
-    "nan pose": (_nan_pose, "start_pose must be finite"),
-    "no rotation": (_no_rotation, "length 1"),
-    "backward": (_backward, "ends at most 1 s after"),
-    "another clock": (_other_clock, "the log lasts from 1532402927600000"),
-    "a million pixels": (_million, "1 to 8192 pixels a side, got 1000000"),
-    "too many pixels": (_too_many, "at most 36,000,000 pixels"),
-    "no lens": (_no_lens, "has no lens"),
-    "flat": (_flat, "focal lengths of camera 0"),
-    "folded": (_folded, "must have an inverse"),
-    "twice": (_twice, "'car' twice"),
-    "stranger": (_stranger, "no object 'caar'"),
-    "nan actor": (_nan_actor, "start_pose of car must be finite"),
-    "far": (_far, "1e\\+09 m from the origin"),
-    "format": (lambda request: setattr(request, "image_format", 0), "image_format is not said"),
-    "quality": (lambda request: setattr(request, "image_quality", NAN), "image_quality lies in"),
-    "mask": (lambda request: setattr(request, "insert_ego_mask", True), "no masks of the vehicle"),
-    "shutter": (lambda request: setattr(request.camera_intrinsics, "shutter_type", 77), "must be one of .* got 77"),
+    "nan pose": (put(f"{POSE}.vec.x", NAN), "start_pose must be finite"),
+    "no rotation": (lambda request: request.sensor_pose.start_pose.quat.Clear(), "length 1"),
+    "backward": (put("frame_end_us", START_US - 1), "ends at most 1 s after"),
+    "another clock": (put("frame_start_us,frame_end_us", 5, 5), "the log lasts from 1532402927600000"),
+    "a million pixels": (put("resolution_w", 10**6), "1 to 8192 pixels a side, got 1000000"),
+    "too many pixels": (put("resolution_w,resolution_h", 8000, 8000), "at most 36,000,000 pixels"),
+    "no lens": (lambda request: request.camera_intrinsics.ClearField("opencv_pinhole_param"), "has no lens"),
+    "flat": (put(f"{LENS}.focal_length_x", 1e-30), "focal lengths of camera 0"),
+    "folded": (put(f"{LENS}.tangential_coeffs.0", 5.0), "must have an inverse"),
+    "twice": (lambda request: [place(request, "car", at(0, 0, 0)) for _ in range(2)], "'car' twice"),
+    "stranger": (lambda request: place(request, "caar", at(0, 0, 0)), "no object 'caar'"),
+    "nan actor": (lambda request: place(request, "car", at(NAN, 0, 0)), "start_pose of car must be finite"),
+    "far": (put(f"{POSE}.vec.x", 1e9), "1e\\+09 m from the origin"),
+    "format": (put("image_format", 0), "image_format is not said"),
+    "quality": (put("image_quality", NAN), "image_quality lies in"),
+    "mask": (put("insert_ego_mask", True), "no masks of the vehicle"),
+    "shutter": (put("camera_intrinsics.shutter_type", 77), "must be one of .* got 77"),
 }
 
 
@@ -229,21 +192,13 @@ def test_what_cannot_be_is_refused_in_a_sentence(street, change, said):
     assert not isinstance(caught.value, NotServedError)
 
 
-def _rational(request):
-    request.camera_intrinsics.opencv_pinhole_param.radial_coeffs[4] = 0.1
-
-
-def _prism(request):
-    request.camera_intrinsics.opencv_pinhole_param.thin_prism_coeffs[1] = 0.1
-
-
 LACKING = {
     "f-theta": (lambda r: r.camera_intrinsics.ftheta_param.SetInParent(), "ftheta.*send opencv_pinhole_param"),
     "fisheye": (lambda r: r.camera_intrinsics.opencv_fisheye_param.SetInParent(), "opencv_fisheye"),
     "windshield": (lambda r: r.camera_intrinsics.bivariate_windshield_model_param.SetInParent(), "windshield"),
-    "rational": (_rational, "k4 to k6"),
-    "prism": (_prism, "thin prism"),
-    "video": (lambda request: setattr(request, "image_format", 5), "got image_format AVC"),
+    "rational": (put(f"{LENS}.radial_coeffs.4", 0.1), "k4 to k6"),
+    "prism": (put(f"{LENS}.thin_prism_coeffs.1", 0.1), "thin prism"),
+    "video": (put("image_format", 5), "got image_format AVC"),
 }
 
 

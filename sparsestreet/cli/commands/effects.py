@@ -57,14 +57,6 @@ def effects(arguments: list[str]) -> int:
     return 0
 
 
-def planned(overrides: Sequence[str]) -> tuple[EffectDecision, ...]:
-    """The plan of a training with these options."""
-    from sparsestreet.cli.runs.run import opened
-
-    _, data, recipe = opened(composed(overrides))
-    return recipe.decisions(recipe.plan(data), data)
-
-
 def known_effects(overrides: Sequence[str]) -> "tuple[Mapping[str, EffectSettings], TrainingData]":
     """The effects that a training with these options knows, and what they would be built from."""
     from sparsestreet.cli.runs.run import opened

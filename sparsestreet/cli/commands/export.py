@@ -162,7 +162,7 @@ def _check(request: ExportRequest, stored: "StoredScene", gaussians: "Gaussians"
     """Read the file again, seen by the camera of the view nearest in time, in the axes of viewers."""
     from sparsestreet.cli.commands.scenes import recorded_views
     from sparsestreet.export.frame import VIEWER_FROM_WORLD
-    from sparsestreet.export.spz import check_file, read_spz, turned_camera
+    from sparsestreet.export.spz import check_file, turned_camera
 
     try:
         views = recorded_views(request.scene, request.views).all
@@ -170,7 +170,7 @@ def _check(request: ExportRequest, stored: "StoredScene", gaussians: "Gaussians"
         camera = turned_camera(nearest.camera, VIEWER_FROM_WORLD)
     except FileNotFoundError:
         camera = None
-    found = check_file(request.out, gaussians, camera, read_spz, stored.options.settings)
+    found = check_file(request.out, gaussians, camera, stored.options.settings)
     quality = "no camera is known" if found.psnr is None else f"{found.psnr:.1f} dB beside what was written"
     print(f"read by {found.reader}: {found.gaussians:,} Gaussians, {quality}, {found.bytes_each:.1f} bytes each")
 

@@ -204,11 +204,9 @@ def value_of(text: str) -> str:
 def without_flags(overrides: Sequence[str]) -> list[str]:
     """The overrides without flags of Hydra's, and without the words after them (``--cfg job``)."""
     pairs = zip(["", *overrides], overrides, strict=False)
-    return [text for before, text in pairs if not _is_flag(before, text)]
-
-
-def _is_flag(before: str, text: str) -> bool:
-    return text.startswith("-") or (before.startswith("-") and "=" not in text)
+    return [
+        text for before, text in pairs if not (text.startswith("-") or (before.startswith("-") and "=" not in text))
+    ]
 
 
 def is_sweep(text: str) -> bool:

@@ -11,7 +11,6 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import Callback, Trainer
-from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig
 
 from sparsestreet.cli.config.compose import check_moved, configuration, resolved
@@ -90,11 +89,6 @@ def trainer_of(cfg: DictConfig, devices: Any) -> Callable[..., Trainer]:
     return instantiate(cfg.trainer, _partial_=True, devices=devices)
 
 
-def logger_of(cfg: DictConfig) -> Logger | bool:
-    """Where curves go; False: nowhere."""
-    return instantiate(cfg.logger) if cfg.logger else False
-
-
 def identity_of(cfg: DictConfig, command: str) -> RunIdentity:
     """What the run is called in its records. Reads the log's files for their hash."""
     return RunIdentity(
@@ -133,7 +127,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
     for note in preset_notes(cfg):
         log.info(note)
     recipe_of(cfg)  # what does not fit together is said before a log is read
-    extra, logger = instantiate(cfg.evaluation, _convert_="all"), logger_of(cfg)
+    extra, logger = instantiate(cfg.evaluation, _convert_="all"), instantiate(cfg.logger) if cfg.logger else False
     stages = StageRecorder(started)
     with stages, stage("data"):
         data = data_of(cfg)
