@@ -30,7 +30,7 @@ from sparsestreet.data.waymo.segment import (
     check_returns,
     world_points,
 )
-from sparsestreet.data.waymo.v1.segment import RecordSegment
+from sparsestreet.data.waymo.v1 import RecordSegment
 from sparsestreet.data.waymo.v2 import TableSegment
 
 _COMPONENTS = ("vehicle_pose", "camera_image", "camera_calibration", "lidar", "lidar_box")

@@ -8,7 +8,7 @@ import pytest
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.waymo import WaymoReader
 from sparsestreet.data.waymo.boxes import middle, readout
-from sparsestreet.data.waymo.v1.segment import RecordSegment
+from sparsestreet.data.waymo.v1 import RecordSegment
 from sparsestreet.data.waymo.v2 import Table, matrix
 from tests.data.waymo import records, tables
 from tests.data.waymo.drive import Drive

@@ -12,8 +12,7 @@ import pytest
 
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.waymo import WaymoReader
-from sparsestreet.data.waymo.v1.records import Records, masked_crc32c
-from sparsestreet.data.waymo.v1.segment import RecordSegment
+from sparsestreet.data.waymo.v1 import Records, RecordSegment, masked_crc32c
 from tests.conftest import unchecked
 from tests.data.damage import daily
 from tests.data.waymo import records
