@@ -12,14 +12,11 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from sparsestreet.data.images import GivenMasks
 from sparsestreet.data.kitti.files import (
     GRAY,
     Calibration,
     Drive,
     DriveClock,
-    Pixels,
-    check_recording,
     elements,
     find_drive,
     numbers,
@@ -33,7 +30,15 @@ from sparsestreet.data.kitti.files import (
 from sparsestreet.data.poses import PosePath, check_extent, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import (
+    Boxes,
+    LidarSweep,
+    Pixels,
+    RecordedImage,
+    RecordedReader,
+    Recording,
+    check_recording,
+)
 from sparsestreet.geometry.cameras import transform_points
 
 EARTH_RADIUS = 6378137.0
@@ -243,16 +248,14 @@ class KittiReader(RecordedReader):
             self.pinhole(name, index, camera.intrinsics, camera.size)
             for index, (name, camera) in enumerate(zip(drive.cameras, cameras, strict=True))
         )
-        sizes = tuple(camera.size for camera in cameras)
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
-        pixels = Pixels(rig, sizes, given)
+        pixels = Pixels(rig, [camera.size for camera in cameras], self.given)
         return Recording(
             name=drive.name,
             rig=rig,
             shots=_shots(drive, parts),
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=frozenset() if given is None else given.kinds,
+            mask_kinds=self.given.kinds if self.given else frozenset(),
             frame_stamps=parts.clock.stamps,
             sweeps=_sweeps(drive, parts) if self.lidar and drive.lidar.is_dir() else None,
             boxes=None if parts.tracklets is None else _boxes(drive, parts, parts.tracklets),
@@ -282,9 +285,8 @@ class KittiReader(RecordedReader):
         drive = self._drive()
         images = [drive.image(camera, frame) for camera, frame in product(drive.cameras, drive.frames)]
         problems = missing_files([*images, *map(drive.oxts, drive.frames)])
-        if self.masks is not None:
-            stems = product(drive.cameras, (drive.image("", frame).stem for frame in drive.frames))
-            problems += GivenMasks(Path(self.masks)).check(stems)
+        if self.given is not None:
+            problems += self.given.check((path.parts[-3], path.stem) for path in images)
         calibration = attempt(problems, lambda: read_calibration(drive.folder.parent, drive.cameras))
         clock = attempt(problems, lambda: read_clock(drive))
         oxts, poses = _read_poses(drive, problems)

@@ -17,7 +17,7 @@ from sparsestreet.data.lidar import check_points
 from sparsestreet.data.poses import PosePath, check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording, check_recording
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import camera_at, middle, read_boxes, shutter
 from sparsestreet.data.waymo.segment import (
@@ -228,7 +228,7 @@ class WaymoReader(RecordedReader):
     def recording(self) -> Recording:
         segment, frames, cameras = self._segment, self._frames, self._cameras
         rig, shots, boxes, notes = self._rig(), *self._placed()
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
+        given = self.given
         if given is not None and (missing := given.check((cameras[shot.camera], shot.stem) for shot in shots)):
             raise LogError(missing)
         labelled = segment.labelled & {shot.key for shot in shots if given is None}
@@ -271,13 +271,7 @@ class WaymoReader(RecordedReader):
         return shots, boxes, notes
 
     def check_contents(self) -> list[Problem]:
-        recording, problems = self.recording(), self._segment.check_files()
-        for shot in recording.shots:
-            attempt(problems, partial(recording.read_image, shot))
-            attempt(problems, partial(recording.read_masks, shot))
-        for sweep in (recording.sweeps or {}).values():
-            attempt(problems, sweep.read)
-        return _once(problems)
+        return _once(self._segment.check_files() + check_recording(self.recording()))
 
     def files(self) -> LogFiles:
         """All components of the segment, lidar too where it is not wanted."""
