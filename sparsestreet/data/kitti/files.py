@@ -241,7 +241,7 @@ def read_turns(drive: Drive, clock: DriveClock) -> tuple[dict[int, tuple[int, in
     return turns, problems
 
 
-def at_frames(stamps: Sequence[int | None], frames: range) -> list[int | None]:
+def at_frames(stamps: Sequence[int | None], frames: Sequence[int]) -> list[int | None]:
     """Line k is that of frame k; None where a file ends early."""
     return [stamps[frame] if frame < len(stamps) else None for frame in frames]
 
@@ -314,8 +314,7 @@ def rectified_camera(table: Mapping[str, str], number: str, path: Path) -> Recti
     """From the lines P_rect_XX and S_rect_XX; raises LogError."""
     projection = keyed_numbers(table, f"P_rect_{number}", (3, 4), path)
     width, height = keyed_numbers(table, f"S_rect_{number}", (2,), path)
-    if not (1 <= width <= 16384 and 1 <= height <= 16384 and width % 1 == 0 and height % 1 == 0):
-        raise fault(path, f"S_rect_{number} is {width:g} x {height:g}, no size of an image", _REMEDY_CALIBRATION)
+    size = image_sides(width, height, path, f"S_rect_{number}")
     matrix = projection[:, :3]
     focal_only = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=bool)
     pinhole = not (matrix[~focal_only] - np.eye(3)[~focal_only]).any() and matrix[0, 0] > 0 and matrix[1, 1] > 0
@@ -327,7 +326,14 @@ def rectified_camera(table: Mapping[str, str], number: str, path: Path) -> Recti
     place[:3, 3] = torch.from_numpy(np.linalg.solve(matrix, projection[:, 3]))
     intrinsics = torch.from_numpy(matrix.copy())
     intrinsics[:2, 2] += 0.5
-    return RectifiedCamera(intrinsics, place, (int(width), int(height)))
+    return RectifiedCamera(intrinsics, place, size)
+
+
+def image_sides(width: float, height: float, path: Path, what: str) -> tuple[int, int]:
+    """Raise LogError unless the numbers can be an image's sides in pixels."""
+    if not all(1 <= side <= 16384 and side % 1 == 0 for side in (width, height)):
+        raise fault(path, f"{what} is {width:g} x {height:g}, no size of an image", _REMEDY_CALIBRATION)
+    return int(width), int(height)
 
 
 def rectifying_rotation(table: Mapping[str, str], number: str, path: Path) -> Float64[Tensor, "4 4"]:

@@ -99,7 +99,7 @@ def read_oxts(path: Path) -> Oxts:
     if len(words) != 30:
         raise fault(path, f"a frame of GPS and IMU has 30 numbers, this file has {len(words)}", _REMEDY_POSE)
     values = numbers(words, path, "the file")
-    latitude, longitude, altitude, roll, pitch, yaw, north, east, _, _, up = values[:11]
+    latitude, longitude, altitude, _, _, _, north, east, _, _, up = values[:11]
     limits = {
         "latitude": (latitude, 85.0),
         "longitude": (longitude, 360.0),
@@ -111,17 +111,8 @@ def read_oxts(path: Path) -> Oxts:
     for what, (value, most) in limits.items():
         if abs(value) > most:
             raise fault(path, f"the {what} {value:g} is beyond {most:g}, no car's", _REMEDY_POSE)
-    rotation = _rotation(roll, pitch, yaw)
+    (rotation,) = rotations(values[None, 3:6])
     return Oxts(latitude, longitude, altitude, rotation, rotation.T @ np.array([east, north, up]), values[17:20])
-
-
-def _rotation(roll: float, pitch: float, yaw: float) -> Float64[np.ndarray, "3 3"]:
-    """Rz(yaw) Ry(pitch) Rx(roll)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
 
 
 _MAX_TRACKLETS_BYTES = 1 << 25
@@ -187,11 +178,16 @@ def _tracklet(item: Element, path: Path, what: str) -> Tracklet:
 
 def _poses(rows: Float64[np.ndarray, "f 7"], height: float) -> Float64[Tensor, "f 4 4"]:
     """From the center of the bottom to that of the box; yaw counts past half a turn, which its sine does not mind."""
-    (x_turn, y_turn, yaw) = rows[:, 3:6].T
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = _about(2, yaw) @ _about(1, y_turn) @ _about(0, x_turn)
+    poses[:, :3, :3] = rotations(rows[:, 3:6])
     poses[:, :3, 3] = rows[:, :3] + 0.5 * height * poses[:, :3, 2]
     return torch.from_numpy(poses)
+
+
+def rotations(angles: Float64[np.ndarray, "f 3"]) -> Float64[np.ndarray, "f 3 3"]:
+    """Rz(yaw) Ry(pitch) Rx(roll) of roll, pitch and yaw."""
+    roll, pitch, yaw = angles.T
+    return _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
 
 
 def _about(axis: int, angles: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, "f 3 3"]:

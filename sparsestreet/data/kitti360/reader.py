@@ -25,13 +25,12 @@ from sparsestreet.data.kitti360.files import (
     Calibration360,
     FisheyeCamera,
     SequenceFolders,
-    check_pose,
     find_sequence,
     read_boxes,
     read_calibration,
     read_poses,
 )
-from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, untwisted
+from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, check_rigid, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recording import (
@@ -162,7 +161,7 @@ class Kitti360Reader(RecordedReader):
             problems += self.given.check((path.parts[-3], path.stem) for path in images)
         if not are_rigid(torch.stack([poses[frame] for frame in frames])):
             for frame in frames:
-                attempt(problems, partial(check_pose, poses[frame], frame, sequence.poses))
+                attempt(problems, partial(check_rigid, poses[frame], sequence.poses, f"the pose of frame {frame}"))
         problems += check_extent([(sequence.poses, poses[frame][:3, 3]) for frame in frames])
         calibration = attempt(problems, lambda: read_calibration(sequence.calibration, sequence.cameras))
         lines = attempt(problems, lambda: read_stamps(sequence.stamps(sequence.cameras[0]))) or []
@@ -204,8 +203,7 @@ class Kitti360Reader(RecordedReader):
 
 
 def _stamps(sequence: SequenceFolders, lines: list[int | None], frames: tuple[int, ...]) -> tuple[int, ...]:
-    stamps = [lines[frame] if frame < len(lines) else None for frame in frames]
-    return increasing(stamps, frames, sequence.stamps(sequence.cameras[0]))
+    return increasing(at_frames(lines, frames), frames, sequence.stamps(sequence.cameras[0]))
 
 
 def _turn(lines: list[int | None], frames: tuple[int, ...]) -> int:

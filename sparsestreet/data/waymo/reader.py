@@ -39,16 +39,11 @@ _MAX_INDEX = 10**6
 """A number above is no place in a list but a name: Hydra takes the digits and underscores of one for a number."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """The segments of a folder, by name: files of version 1, folders of components of version 2."""
+def find_segments(root: Path) -> dict[str, Path]:
+    """The segments of a folder, by name: files of version 1, or folders of components of version 2.
 
-    version: int
-    places: Mapping[str, Path]
-
-
-def find_segments(root: Path) -> Found:
-    """Raise LogError for a folder that holds segments of neither version, or of both."""
+    Raises LogError for a folder that holds segments of neither version, or of both.
+    """
     if not root.is_dir():
         raise fault(root, "there is no such folder", "name the folder that holds Waymo's files (data.root)")
     records = {canonical(path.name): path for pattern in _RECORDS for path in sorted(root.glob(pattern))}
@@ -64,7 +59,7 @@ def find_segments(root: Path) -> Found:
     if not records and not tables:
         message = "it holds neither *.tfrecord (version 1) nor component/*.parquet (version 2), up to two folders deep"
         raise fault(root, message, "name the folder that holds Waymo's files (data.root)")
-    return Found(1, records) if records else Found(2, tables)
+    return records or tables
 
 
 def find_segment(root: Path, scene: str | int | None, scenes: Path | None) -> Segment:
@@ -77,14 +72,12 @@ def find_segment(root: Path, scene: str | int | None, scenes: Path | None) -> Se
 
     Raises LogError for files at fault, ValueError for a scene that is not there.
     """
-    found = find_segments(root)
-    name = _wanted(found, scene, scenes, root)
-    place = found.places[name]
-    return RecordSegment(place) if found.version == 1 else TableSegment(place, name)
+    places = find_segments(root)
+    name = _wanted(sorted(places), scene, scenes, root)
+    return TableSegment(places[name], name) if places[name].is_dir() else RecordSegment(places[name])
 
 
-def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Path) -> str:
-    names = sorted(found.places)
+def _wanted(names: Sequence[str], scene: str | int | None, scenes: Path | None, root: Path) -> str:
     shown = listed(names)
     if scene is None:
         if len(names) > 1:
@@ -96,7 +89,7 @@ def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Pa
         name = next((name for name in names if name.replace("_", "") == str(scene)), str(scene))
     else:
         name = canonical(scene)
-    if name not in found.places:
+    if name not in names:
         raise ValueError(f"segment {name} is not in {root}: data.log.scene must be one of {shown}")
     return name
 
