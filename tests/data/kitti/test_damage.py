@@ -43,7 +43,7 @@ DAMAGES = {
     "scaled mount": (LIDAR, line(1, "R: 2 0 0 0 2 0 0 0 2"), "no rigid transform"),
     "no image": (IMAGE, gone, "the file is missing"),
     "torn image": (IMAGE, cut, "cannot be decoded"),
-    "small image": (IMAGE, png(16, 12), "the image is 16x12, its calibration is for 32x24"),
+    "low image": (IMAGE, png(32, 12), "the image is 32x12, its calibration is for 32x24"),
     "no pose": (OXTS, gone, "the file is missing"),
     "two poses in a file": (OXTS, lambda path: path.write_text(2 * path.read_text()), "this file has 60"),
     "NaN in a pose": (OXTS, word(4, "nan"), "NaN or infinity"),

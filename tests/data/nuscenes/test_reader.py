@@ -169,6 +169,13 @@ def test_the_lowest_rows_of_the_back_camera_show_the_car(scene, rows, tmp_path):
     # 80 of 900 rows, or 146: 2.1 of 24, or 3.9, so three rows or four hold some of them.
     assert there(back.ego).any(1).tolist() == [False] * (24 - rows) + [True] * rows
     assert log.frames[0].ego is None
+    # Masks that somebody made of another kind leave it.
+    for frame in range(4):
+        path = tmp_path / "masks/sky/CAM_BACK" / f"{drive.file('CAM_FRONT_LEFT', frame).stem}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (32, 24)).save(path)
+    given = NuScenesReader(root=drive.root, masks=tmp_path / "masks").read().frames[1]
+    assert torch.equal(there(given.ego), there(back.ego))
 
 
 def test_the_hash_is_of_the_scene_in_whatever_tables(drive, tmp_path):

@@ -60,6 +60,7 @@ FIELDS = {
     "mount": (calibration([(2, 0), 3], b""), "extrinsic has 0 numbers, not 16"),
     "beams in disorder": (calibration([(3, 0), 2], doubles(2, [0.1, 0, 0.2, 0.3, 0.4, 0.5])), "no ascending angles"),
     "beams beyond": (calibration([(3, 0), 2], doubles(2, [0.1, 0.2, 0.3, 0.4, 0.5, 9])), "up to a quarter turn"),
+    "limits in disorder": (calibration([(3, 1), 3], double(3, 1.0)), "no ascending angles"),
     "a beam too few": (calibration([(3, 0), 2], doubles(2, [0.1, 0.2, 0.3, 0.4, 0.5])), "5 inclinations"),
     "uncalibrated lidar": (calibration([(3, 1), 1], integer(1, 5)), "lidar FRONT has range images, but no calibration"),
     "velocity": (field([(4, 1), 4, 1], double(1, NAN)), "frame 1, images 1 has velocities or times that are NaN"),

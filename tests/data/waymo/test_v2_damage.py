@@ -187,12 +187,14 @@ def test_types_names_and_orders_of_genuine_files(components, tmp_path, roots):
         found = [row | {CAMERA: names[row[CAMERA]]} if CAMERA in row else row for row in rows]
         return [found[place] for place in np.random.default_rng(2).permutation(len(found))]
 
-    tables.write_drive(tmp_path, Drive(), change=change, single=True, group=1000)
+    drive = Drive(labelled=((1, "front"), (2, "left")))
+    tables.write_drive(tmp_path, drive, change=change, single=True, group=1000)
     one, other = WaymoReader(root=tmp_path).recording(), WaymoReader(root=roots[2]).recording()
     for shot, same in zip(one.shots, other.shots, strict=True):
         # float32 at 4 km: 0.24 mm an axis.
         np.testing.assert_allclose(shot.world_from_camera, same.world_from_camera, atol=5e-4)
         assert np.array_equal(one.read_image(shot), other.read_image(same))
+        assert bool(one.read_masks(shot)) == ((shot.frame, shot.camera) in ((1, 0), (2, 1)))
     for frame in (2, 0, 3):
         np.testing.assert_allclose(one.sweeps[frame].read(), other.sweeps[frame].read(), atol=1e-3)
 
