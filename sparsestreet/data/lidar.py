@@ -5,11 +5,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from sparsestreet.atomic import check_regular
 from sparsestreet.data.lazy import Frames, Sweeps, spread
 from sparsestreet.data.log import DrivingLog, Split
 from sparsestreet.data.problems import attempt, fault
@@ -34,6 +36,22 @@ def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "d
     if broken:
         message = f"{broken} of {points.shape[0]} points are NaN, infinite or more than {_FARTHEST:g} m away"
         raise fault(path, message, remedy)
+
+
+def sensor_points(path: Path, columns: int, *, max_bytes: int, remedy: str) -> Float64[Tensor, "n 3"]:
+    """Points of rows of float32, which begin with x, y, z. Raises LogError, naming the file, for one that has none."""
+    try:
+        size = path.stat().st_size
+        if size % (4 * columns) or size > max_bytes:
+            message = f"{size} bytes are no whole number of rows of {columns} float32, or more than {max_bytes}"
+            raise fault(path, message, remedy)
+        check_regular(path)
+        rows = np.fromfile(path, dtype="<f4").reshape(-1, columns)
+    except OSError as error:
+        raise fault(path, f"the sweep cannot be read ({error})", remedy) from error
+    points = torch.from_numpy(rows[:, :3].copy()).double()
+    check_points(points, path, remedy=remedy)
+    return points
 
 
 def returned(points: Float64[Tensor, "n 3"]) -> Bool[Tensor, " n"]:

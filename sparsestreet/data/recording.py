@@ -19,7 +19,15 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.frame_cache import CacheSize, FrameCache, LruCache, MemoryForecast, cache_bytes
-from sparsestreet.data.images import check_camera_images, image_notes, joined, read_transparent
+from sparsestreet.data.images import (
+    GivenMasks,
+    check_camera_images,
+    image_notes,
+    image_size,
+    joined,
+    read_image,
+    read_transparent,
+)
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
 from sparsestreet.data.log import DrivingLog, VehiclePath, absence_notes
@@ -255,6 +263,59 @@ class Recording:
     """What a user should know about how it was read, one sentence each."""
 
 
+Masks = Mapping[str, Bool[Tensor, "h w"]]
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Decodes images whose files are the keys of their shots, and the masks of these."""
+
+    rig: Sequence[RigCamera[str]]
+    recorded_sizes: Sequence[tuple[int, int]]
+    """(width, height) that each camera's images have."""
+    given: GivenMasks | None
+    shipped: Callable[[RecordedImage], Masks] = lambda shot: {}
+    """Masks of the data set itself; those that are given replace them kind by kind."""
+    said: str = "its calibration is for"
+    """Where the sizes are from."""
+
+    def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
+        path, camera = Path(str(shot.key)), self.rig[shot.camera]
+        check_size(path, self.recorded_sizes[shot.camera], self.said)
+        return read_image(path, camera.size, camera.undistortion)
+
+    def masks(self, shot: RecordedImage) -> Masks:
+        camera, shipped = self.rig[shot.camera], self.shipped(shot)
+        if self.given is None:
+            return shipped
+        return dict(shipped) | self.given.read(
+            camera.name,
+            shot.stem,
+            recorded_size=self.recorded_sizes[shot.camera],
+            size=camera.size,
+            undistortion=camera.undistortion,
+        )
+
+
+def check_size(path: Path, size: tuple[int, int], said: str = Pixels.said) -> None:
+    """Raise LogError unless the header has this (width, height), which is ``said`` somewhere; nothing is decoded."""
+    found = image_size(path)
+    if found != size:
+        message = "the image is {}x{}, {} {}x{}".format(*found, said, *size)
+        raise fault(path, message, "copy images and calibration from the same archive")
+
+
+def check_recording(recording: Recording) -> list[Problem]:
+    """What is wrong with images, masks and points, all of which are decoded, one at a time."""
+    problems: list[Problem] = []
+    for shot in recording.shots:
+        attempt(problems, partial(recording.read_image, shot))
+        attempt(problems, partial(recording.read_masks, shot))
+    for sweep in (recording.sweeps or {}).values():
+        attempt(problems, sweep.read)
+    return problems
+
+
 @dataclass(frozen=True, kw_only=True)
 class RecordedReader(LogReader):
     """A data set as its publisher ships it. Subclasses say how to find and decode its files."""
@@ -296,6 +357,11 @@ class RecordedReader(LogReader):
         for sweep in (recording.sweeps or {}).values():
             attempt(problems, sweep.read)
         return problems
+
+    @property
+    def given(self) -> GivenMasks | None:
+        """The masks that somebody made."""
+        return None if self.masks is None else GivenMasks(Path(self.masks))
 
     def pinhole(
         self, name: str, index: int, intrinsics: Float64[Tensor, "3 3"], recorded_size: tuple[int, int]

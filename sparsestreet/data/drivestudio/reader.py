@@ -1,6 +1,6 @@
 """From a folder in DriveStudio's processed layout to a DrivingLog."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -49,26 +49,23 @@ def check_layout(layout: Layout, *, contents: bool) -> list[Problem]:
 
     ``contents=False`` is quick: it trusts lidar points of the right size, and images that are not cut short.
     """
-    return [
-        *missing_files(required_files(layout)),
-        *_check_cameras(layout),
-        *_check_poses(layout),
-        *_check_clock(layout),
-        *_check_images(layout, contents),
-        *_check_sweeps(layout, contents),
-    ]
-
-
-def _check_cameras(layout: Layout) -> list[Problem]:
-    problems: list[Problem] = []
+    problems = missing_files(required_files(layout))
     for camera in layout.cameras:
-        path = layout.intrinsics(camera)
-        if path.is_file():
-            # A broken image is reported with the images, once.
-            found: list[Problem] = []
-            attempt(found, partial(_check_camera, layout, camera))
-            problems += [problem for problem in found if problem.path == path]
+        problems += _own(layout.intrinsics(camera), partial(_check_camera, layout, camera))
+    problems += _check_poses(layout)
+    attempt(problems, partial(read_clock, layout))
+    problems += _check_images(layout, contents)
+    for frame in layout.frames if layout.has_lidar else ():
+        problems += _own(layout.sweep(frame), partial(read_sweep if contents else check_sweep_size, layout, frame))
     return problems
+
+
+def _own(path: Path, read: Callable[[], object]) -> list[Problem]:
+    """Those of the file alone, if it is there: broken images and poses, which are read with it, are reported once."""
+    found: list[Problem] = []
+    if path.is_file():
+        attempt(found, read)
+    return [problem for problem in found if problem.path == path]
 
 
 def _check_camera(layout: Layout, camera: int) -> None:
@@ -103,24 +100,6 @@ def _check_images(layout: Layout, contents: bool) -> list[Problem]:
         masks = [layout.mask(kind, frame, camera) for kind in MASK_KINDS for frame in layout.frames]
         masks = [path for path in (*masks, layout.ego_mask(camera)) if path is not None]
         problems += check_camera_images(camera, images, masks, decode=contents)
-    return problems
-
-
-def _check_clock(layout: Layout) -> list[Problem]:
-    problems: list[Problem] = []
-    attempt(problems, partial(read_clock, layout))
-    return problems
-
-
-def _check_sweeps(layout: Layout, contents: bool) -> list[Problem]:
-    problems: list[Problem] = []
-    for frame in layout.frames if layout.has_lidar else ():
-        if not layout.sweep(frame).is_file():
-            continue
-        # A broken pose is reported with the poses, once.
-        found: list[Problem] = []
-        attempt(found, partial(read_sweep if contents else check_sweep_size, layout, frame))
-        problems += [problem for problem in found if problem.path == layout.sweep(frame)]
     return problems
 
 

@@ -1,10 +1,9 @@
-"""Files of a KITTI drive, several of which KITTI-360 shares: layout, stamps, calibration, sweeps and masks."""
+"""Files of a KITTI drive, several of which KITTI-360 shares: layout, stamps, calibration and sweeps."""
 
 import calendar
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from statistics import median_low
 from xml.etree.ElementTree import Element, ParseError
@@ -13,17 +12,14 @@ import numpy as np
 import torch
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import iterparse
-from jaxtyping import Bool, Float64, Int64, UInt8
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.images import GivenMasks, image_size, read_image
-from sparsestreet.data.lidar import check_points
+from sparsestreet.data.lidar import sensor_points
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import chosen_cameras, frame_window, listed
-from sparsestreet.data.recording import RecordedImage, Recording
-from sparsestreet.data.rig import RigCamera
 from sparsestreet.geometry.cameras import inverse
 
 _MAX_TEXT_BYTES = 1 << 26
@@ -245,7 +241,7 @@ def read_turns(drive: Drive, clock: DriveClock) -> tuple[dict[int, tuple[int, in
     return turns, problems
 
 
-def at_frames(stamps: Sequence[int | None], frames: range) -> list[int | None]:
+def at_frames(stamps: Sequence[int | None], frames: Sequence[int]) -> list[int | None]:
     """Line k is that of frame k; None where a file ends early."""
     return [stamps[frame] if frame < len(stamps) else None for frame in frames]
 
@@ -318,8 +314,7 @@ def rectified_camera(table: Mapping[str, str], number: str, path: Path) -> Recti
     """From the lines P_rect_XX and S_rect_XX; raises LogError."""
     projection = keyed_numbers(table, f"P_rect_{number}", (3, 4), path)
     width, height = keyed_numbers(table, f"S_rect_{number}", (2,), path)
-    if not (1 <= width <= 16384 and 1 <= height <= 16384 and width % 1 == 0 and height % 1 == 0):
-        raise fault(path, f"S_rect_{number} is {width:g} x {height:g}, no size of an image", _REMEDY_CALIBRATION)
+    size = image_sides(width, height, path, f"S_rect_{number}")
     matrix = projection[:, :3]
     focal_only = np.array([[1, 0, 1], [0, 1, 1], [0, 0, 0]], dtype=bool)
     pinhole = not (matrix[~focal_only] - np.eye(3)[~focal_only]).any() and matrix[0, 0] > 0 and matrix[1, 1] > 0
@@ -331,7 +326,14 @@ def rectified_camera(table: Mapping[str, str], number: str, path: Path) -> Recti
     place[:3, 3] = torch.from_numpy(np.linalg.solve(matrix, projection[:, 3]))
     intrinsics = torch.from_numpy(matrix.copy())
     intrinsics[:2, 2] += 0.5
-    return RectifiedCamera(intrinsics, place, (int(width), int(height)))
+    return RectifiedCamera(intrinsics, place, size)
+
+
+def image_sides(width: float, height: float, path: Path, what: str) -> tuple[int, int]:
+    """Raise LogError unless the numbers can be an image's sides in pixels."""
+    if not all(1 <= side <= 16384 and side % 1 == 0 for side in (width, height)):
+        raise fault(path, f"{what} is {width:g} x {height:g}, no size of an image", _REMEDY_CALIBRATION)
+    return int(width), int(height)
 
 
 def rectifying_rotation(table: Mapping[str, str], number: str, path: Path) -> Float64[Tensor, "4 4"]:
@@ -358,7 +360,6 @@ def _read_rigid(path: Path) -> Float64[Tensor, "4 4"]:
 
 OWN_CAR = 2.5
 """Meters: in the sample of drive 2011_09_26_0005 the 34 returns nearer than this are of the car, the next is at 2.6."""
-_ROW = 16
 _MAX_SWEEP_BYTES = 1 << 24
 """Bytes, a million points; a sweep has 120,000."""
 _REMEDY_SWEEP = "copy it again from the published archive, or remove it to read its frame without lidar"
@@ -366,17 +367,7 @@ _REMEDY_SWEEP = "copy it again from the published archive, or remove it to read 
 
 def read_points(path: Path) -> Float64[Tensor, "n 3"]:
     """x forward, y left, z up, without the returns of the own car; raises LogError for a file that is no sweep."""
-    try:
-        size = path.stat().st_size
-        if size % _ROW or size > _MAX_SWEEP_BYTES:
-            message = f"{size} bytes are no whole number of rows of 4 float32, or more than {_MAX_SWEEP_BYTES}"
-            raise fault(path, message, _REMEDY_SWEEP)
-        check_regular(path)
-        rows = np.fromfile(path, dtype="<f4").reshape(-1, 4)
-    except OSError as error:
-        raise fault(path, f"the file cannot be read ({error})", _REMEDY_SWEEP) from error
-    points = torch.from_numpy(rows[:, :3].copy()).double()
-    check_points(points, path, remedy=_REMEDY_SWEEP)
+    points = sensor_points(path, 4, max_bytes=_MAX_SWEEP_BYTES, remedy=_REMEDY_SWEEP)
     return points[points.norm(dim=-1) >= OWN_CAR]
 
 
@@ -390,58 +381,6 @@ def point_stamps(points: Float64[Tensor, "n 3"], begin: int, end: int) -> Int64[
     """
     fraction = (torch.pi - torch.atan2(points[:, 1], points[:, 0])) / (2 * torch.pi)
     return begin + (fraction * (end - begin)).round().long()
-
-
-Masks = Mapping[str, Bool[Tensor, "h w"]]
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """Decodes the images of a rig, whose files are the keys of the shots."""
-
-    rig: tuple[RigCamera[str], ...]
-    recorded_sizes: tuple[tuple[int, int], ...]
-    """(width, height) that each camera's calibration has."""
-    given: GivenMasks | None = None
-    shipped: Callable[[RecordedImage], Masks] | None = None
-    """Masks of the data set itself; those that are given replace them kind by kind."""
-
-    def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-        path, camera = Path(str(shot.key)), self.rig[shot.camera]
-        check_size(path, self.recorded_sizes[shot.camera])
-        return read_image(path, camera.size, camera.undistortion)
-
-    def masks(self, shot: RecordedImage) -> Masks:
-        camera = self.rig[shot.camera]
-        masks = {} if self.shipped is None else dict(self.shipped(shot))
-        if self.given is not None:
-            masks |= self.given.read(
-                camera.name,
-                shot.stem,
-                recorded_size=self.recorded_sizes[shot.camera],
-                size=camera.size,
-                undistortion=camera.undistortion,
-            )
-        return masks
-
-
-def check_size(path: Path, size: tuple[int, int]) -> None:
-    """Raise LogError unless the header says this (width, height); nothing is decoded."""
-    found = image_size(path)
-    if found != size:
-        message = "the image is {}x{}, its calibration is for {}x{}".format(*found, *size)
-        raise fault(path, message, "copy images and calibration from the same archive")
-
-
-def check_recording(recording: Recording) -> list[Problem]:
-    """What is wrong with images, masks and points, all of which are decoded, one at a time."""
-    problems: list[Problem] = []
-    for shot in recording.shots:
-        attempt(problems, partial(recording.read_image, shot))
-        attempt(problems, partial(recording.read_masks, shot))
-    for sweep in (recording.sweeps or {}).values():
-        attempt(problems, sweep.read)
-    return problems
 
 
 _MAX_DEPTH = 64

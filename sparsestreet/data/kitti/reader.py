@@ -12,14 +12,11 @@ import torch
 from jaxtyping import Float64, Int
 from torch import Tensor
 
-from sparsestreet.data.images import GivenMasks
 from sparsestreet.data.kitti.files import (
     GRAY,
     Calibration,
     Drive,
     DriveClock,
-    Pixels,
-    check_recording,
     elements,
     find_drive,
     numbers,
@@ -33,7 +30,15 @@ from sparsestreet.data.kitti.files import (
 from sparsestreet.data.poses import PosePath, check_extent, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import (
+    Boxes,
+    LidarSweep,
+    Pixels,
+    RecordedImage,
+    RecordedReader,
+    Recording,
+    check_recording,
+)
 from sparsestreet.geometry.cameras import transform_points
 
 EARTH_RADIUS = 6378137.0
@@ -94,7 +99,7 @@ def read_oxts(path: Path) -> Oxts:
     if len(words) != 30:
         raise fault(path, f"a frame of GPS and IMU has 30 numbers, this file has {len(words)}", _REMEDY_POSE)
     values = numbers(words, path, "the file")
-    latitude, longitude, altitude, roll, pitch, yaw, north, east, _, _, up = values[:11]
+    latitude, longitude, altitude, _, _, _, north, east, _, _, up = values[:11]
     limits = {
         "latitude": (latitude, 85.0),
         "longitude": (longitude, 360.0),
@@ -106,17 +111,8 @@ def read_oxts(path: Path) -> Oxts:
     for what, (value, most) in limits.items():
         if abs(value) > most:
             raise fault(path, f"the {what} {value:g} is beyond {most:g}, no car's", _REMEDY_POSE)
-    rotation = _rotation(roll, pitch, yaw)
+    (rotation,) = rotations(values[None, 3:6])
     return Oxts(latitude, longitude, altitude, rotation, rotation.T @ np.array([east, north, up]), values[17:20])
-
-
-def _rotation(roll: float, pitch: float, yaw: float) -> Float64[np.ndarray, "3 3"]:
-    """Rz(yaw) Ry(pitch) Rx(roll)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    return about_z @ about_y @ about_x
 
 
 _MAX_TRACKLETS_BYTES = 1 << 25
@@ -182,11 +178,16 @@ def _tracklet(item: Element, path: Path, what: str) -> Tracklet:
 
 def _poses(rows: Float64[np.ndarray, "f 7"], height: float) -> Float64[Tensor, "f 4 4"]:
     """From the center of the bottom to that of the box; yaw counts past half a turn, which its sine does not mind."""
-    (x_turn, y_turn, yaw) = rows[:, 3:6].T
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = _about(2, yaw) @ _about(1, y_turn) @ _about(0, x_turn)
+    poses[:, :3, :3] = rotations(rows[:, 3:6])
     poses[:, :3, 3] = rows[:, :3] + 0.5 * height * poses[:, :3, 2]
     return torch.from_numpy(poses)
+
+
+def rotations(angles: Float64[np.ndarray, "f 3"]) -> Float64[np.ndarray, "f 3 3"]:
+    """Rz(yaw) Ry(pitch) Rx(roll) of roll, pitch and yaw."""
+    roll, pitch, yaw = angles.T
+    return _about(2, yaw) @ _about(1, pitch) @ _about(0, roll)
 
 
 def _about(axis: int, angles: Float64[np.ndarray, " f"]) -> Float64[np.ndarray, "f 3 3"]:
@@ -243,16 +244,14 @@ class KittiReader(RecordedReader):
             self.pinhole(name, index, camera.intrinsics, camera.size)
             for index, (name, camera) in enumerate(zip(drive.cameras, cameras, strict=True))
         )
-        sizes = tuple(camera.size for camera in cameras)
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
-        pixels = Pixels(rig, sizes, given)
+        pixels = Pixels(rig, [camera.size for camera in cameras], self.given)
         return Recording(
             name=drive.name,
             rig=rig,
             shots=_shots(drive, parts),
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=frozenset() if given is None else given.kinds,
+            mask_kinds=self.given.kinds if self.given else frozenset(),
             frame_stamps=parts.clock.stamps,
             sweeps=_sweeps(drive, parts) if self.lidar and drive.lidar.is_dir() else None,
             boxes=None if parts.tracklets is None else _boxes(drive, parts, parts.tracklets),
@@ -282,9 +281,8 @@ class KittiReader(RecordedReader):
         drive = self._drive()
         images = [drive.image(camera, frame) for camera, frame in product(drive.cameras, drive.frames)]
         problems = missing_files([*images, *map(drive.oxts, drive.frames)])
-        if self.masks is not None:
-            stems = product(drive.cameras, (drive.image("", frame).stem for frame in drive.frames))
-            problems += GivenMasks(Path(self.masks)).check(stems)
+        if self.given is not None:
+            problems += self.given.check((path.parts[-3], path.stem) for path in images)
         calibration = attempt(problems, lambda: read_calibration(drive.folder.parent, drive.cameras))
         clock = attempt(problems, lambda: read_clock(drive))
         oxts, poses = _read_poses(drive, problems)

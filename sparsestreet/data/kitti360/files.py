@@ -14,6 +14,7 @@ from torch import Tensor
 from sparsestreet.data.kitti.files import (
     RectifiedCamera,
     elements,
+    image_sides,
     keyed_numbers,
     numbers,
     read_keyed,
@@ -22,7 +23,6 @@ from sparsestreet.data.kitti.files import (
     rectifying_rotation,
     rigid,
 )
-from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import chosen_cameras, listed
 from sparsestreet.data.recording import Boxes
@@ -136,14 +136,11 @@ def read_fisheye(path: Path) -> FisheyeCamera:
         raise fault(path, f"model_type is {kind!r}, the lens that is read is MEI", _REMEDY)
     names = (*_SHAPE, "u0", "v0", "image_width", "image_height")
     values = {name: float(keyed_numbers(table, name, (1,), path)[0]) for name in names}
-    width, height = values["image_width"], values["image_height"]
-    if not (1 <= width <= 16384 and 1 <= height <= 16384 and width % 1 == 0 and height % 1 == 0):
-        raise fault(path, f"the image is {width:g} x {height:g}, no size of an image", _REMEDY)
+    size = image_sides(values["image_width"], values["image_height"], path, "the image")
     try:
         lens = Mei(u0=values["u0"] + 0.5, v0=values["v0"] + 0.5, **{name: values[name] for name in _SHAPE})
     except ValueError as error:
         raise fault(path, str(error), _REMEDY) from error
-    size = int(width), int(height)
     check_lens_camera(path, lens, size)
     return FisheyeCamera(lens, size)
 
@@ -160,7 +157,7 @@ class Calibration360:
 def read_poses(path: Path) -> dict[int, Float64[Tensor, "4 4"]]:
     """Frame -> world_from_imu; raises LogError for lines that are no frame with a 3x4 matrix, or out of order.
 
-    Whether the matrices are rigid is asked of those that are used (``check_pose``).
+    Whether the matrices are rigid is asked of those that are used.
     """
     poses: dict[int, Float64[Tensor, "4 4"]] = {}
     last = -1
@@ -179,11 +176,6 @@ def read_poses(path: Path) -> dict[int, Float64[Tensor, "4 4"]]:
     if not poses:
         raise fault(path, "the file holds no poses", _REMEDY)
     return poses
-
-
-def check_pose(pose: Float64[Tensor, "4 4"], frame: int, path: Path) -> None:
-    """Raise LogError unless the pose is rigid."""
-    check_rigid(pose, path, f"the pose of frame {frame}")
 
 
 def read_calibration(folder: Path, cameras: Sequence[str]) -> Calibration360:

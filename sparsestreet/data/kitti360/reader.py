@@ -13,13 +13,8 @@ from PIL import Image
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.images import GivenMasks
 from sparsestreet.data.kitti.files import (
-    Masks,
-    Pixels,
     at_frames,
-    check_recording,
-    check_size,
     increasing,
     point_stamps,
     read_points,
@@ -30,16 +25,25 @@ from sparsestreet.data.kitti360.files import (
     Calibration360,
     FisheyeCamera,
     SequenceFolders,
-    check_pose,
     find_sequence,
     read_boxes,
     read_calibration,
     read_poses,
 )
-from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, untwisted
+from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, check_rigid, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import (
+    Boxes,
+    LidarSweep,
+    Masks,
+    Pixels,
+    RecordedImage,
+    RecordedReader,
+    Recording,
+    check_recording,
+    check_size,
+)
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.cameras import rigidity_error, transform_points
 
@@ -103,16 +107,15 @@ class Kitti360Reader(RecordedReader):
         sequence, parts = self._sequence(), self._parts()
         rig = tuple(self._rig_camera(parts.calibration, index, name) for index, name in enumerate(sequence.cameras))
         sizes = tuple(parts.calibration.cameras[name].size for name in sequence.cameras)
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
-        labeled = _labeled(sequence, parts.frames) if given is None else set()
-        pixels = Pixels(rig, sizes, given, partial(_labels, sequence, rig, sizes, labeled))
+        labeled = _labeled(sequence, parts.frames) if self.given is None else set()
+        pixels = Pixels(rig, sizes, self.given, partial(_labels, sequence, rig, sizes, labeled))
         return Recording(
             name=sequence.name.removesuffix("_sync"),
             rig=rig,
             shots=_shots(sequence, parts),
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=frozenset(KINDS if labeled else ()) if given is None else given.kinds,
+            mask_kinds=self.given.kinds if self.given else frozenset(KINDS if labeled else ()),
             frame_stamps=parts.stamps,
             sweeps=_sweeps(sequence, parts) if self.lidar and sequence.lidar.is_dir() else None,
             boxes=parts.boxes,
@@ -154,12 +157,11 @@ class Kitti360Reader(RecordedReader):
         frames = self._window(sequence, poses)
         images = [sequence.image(camera, frame) for camera, frame in product(sequence.cameras, frames)]
         problems = missing_files(images)
-        if self.masks is not None:
-            stems = product(sequence.cameras, (sequence.image("", frame).stem for frame in frames))
-            problems += GivenMasks(Path(self.masks)).check(stems)
+        if self.given is not None:
+            problems += self.given.check((path.parts[-3], path.stem) for path in images)
         if not are_rigid(torch.stack([poses[frame] for frame in frames])):
             for frame in frames:
-                attempt(problems, partial(check_pose, poses[frame], frame, sequence.poses))
+                attempt(problems, partial(check_rigid, poses[frame], sequence.poses, f"the pose of frame {frame}"))
         problems += check_extent([(sequence.poses, poses[frame][:3, 3]) for frame in frames])
         calibration = attempt(problems, lambda: read_calibration(sequence.calibration, sequence.cameras))
         lines = attempt(problems, lambda: read_stamps(sequence.stamps(sequence.cameras[0]))) or []
@@ -201,8 +203,7 @@ class Kitti360Reader(RecordedReader):
 
 
 def _stamps(sequence: SequenceFolders, lines: list[int | None], frames: tuple[int, ...]) -> tuple[int, ...]:
-    stamps = [lines[frame] if frame < len(lines) else None for frame in frames]
-    return increasing(stamps, frames, sequence.stamps(sequence.cameras[0]))
+    return increasing(at_frames(lines, frames), frames, sequence.stamps(sequence.cameras[0]))
 
 
 def _turn(lines: list[int | None], frames: tuple[int, ...]) -> int:

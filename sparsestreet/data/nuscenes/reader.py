@@ -11,20 +11,27 @@ from typing import get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from sparsestreet.atomic import check_regular
 from sparsestreet.data.hood import bottom_rows
-from sparsestreet.data.images import GivenMasks, check_camera_images, image_size, read_image
-from sparsestreet.data.lidar import check_points
+from sparsestreet.data.lidar import sensor_points
 from sparsestreet.data.nuscenes.selection import Rate, Selection, select
 from sparsestreet.data.nuscenes.tables import LIDAR, DataFile, Row, SceneFiles, all_rows, pose_of, rows_of_tokens
 from sparsestreet.data.poses import check_extent
-from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.problems import LogError, Problem, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles, hash_files
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
-from sparsestreet.data.rig import RigCamera, rig_camera
+from sparsestreet.data.recording import (
+    Boxes,
+    LidarSweep,
+    Masks,
+    Pixels,
+    RecordedImage,
+    RecordedReader,
+    Recording,
+    check_recording,
+)
+from sparsestreet.data.rig import RigCamera
 from sparsestreet.geometry.cameras import transform_points
 
 _MAX_SIDE = 1 << 14
@@ -45,39 +52,13 @@ def recorded_size(files: Sequence[DataFile]) -> tuple[int, int]:
     return sizes[0]
 
 
-def nuscenes_camera(
-    scene: SceneFiles,
-    name: str,
-    index: int,
-    files: Sequence[DataFile],
-    *,
-    width: int | None,
-    principal_shift: float | int,
-) -> RigCamera[str]:
-    """A pinhole: the publisher has taken the lens out of the images. Raises LogError for broken intrinsics.
-
-    Args:
-        scene: with the calibrations.
-        name: channel.
-        index: place in the log's rig.
-        files: images of the camera, at least one.
-        width: to which images are scaled; None: as recorded.
-        principal_shift: pixels that are added to cx and cy.
-    """
+def camera_intrinsics(scene: SceneFiles, name: str, files: Sequence[DataFile]) -> Float64[np.ndarray, "3 3"]:
+    """Those of all images of a camera, as the tables have them. Raises LogError where they differ or are broken."""
     intrinsics = [_intrinsics(scene, file) for file in files]
     for file, one in zip(files, intrinsics, strict=True):
         if not np.array_equal(one, intrinsics[0]):
             raise file.row.fault("calibrated_sensor_token", f"must have the intrinsics of all {name}", one.tolist())
-    shifted = torch.from_numpy(intrinsics[0].copy())
-    shifted[:2, 2] += principal_shift
-    return rig_camera(
-        name,
-        index,
-        intrinsics=shifted,
-        distortion=torch.zeros(5, dtype=torch.float64),
-        recorded_size=recorded_size(files),
-        width=width,
-    )
+    return intrinsics[0]
 
 
 def ego_mask(scene: str, camera: RigCamera[str]) -> Bool[Tensor, "h w"] | None:
@@ -97,46 +78,6 @@ def _intrinsics(scene: SceneFiles, file: DataFile) -> Float64[np.ndarray, "3 3"]
     return intrinsics
 
 
-@dataclass(frozen=True)
-class ScenePixels:
-    """Pixels of shots."""
-
-    rig: Sequence[RigCamera[str]]
-    recorded_sizes: Sequence[tuple[int, int]]
-    """(width, height) of each camera of the rig."""
-    scene: str
-    """Its name."""
-    given: GivenMasks | None
-
-    @property
-    def mask_kinds(self) -> frozenset[str]:
-        ego = frozenset({"ego"} if any(ego_mask(self.scene, camera) is not None for camera in self.rig) else ())
-        return ego if self.given is None else ego | self.given.kinds
-
-    def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-        path = Path(str(shot.key))
-        check_size(path, self.recorded_sizes[shot.camera])
-        return read_image(path, self.rig[shot.camera].size)
-
-    def masks(self, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
-        """Those that somebody made; the rows of the recording car where they have none of it."""
-        camera = self.rig[shot.camera]
-        ego = ego_mask(self.scene, camera)
-        known = {} if ego is None else {"ego": ego}
-        if self.given is None:
-            return known
-        recorded = self.recorded_sizes[shot.camera]
-        return known | self.given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size)
-
-
-def check_size(path: Path, size: tuple[int, int]) -> None:
-    """Raise LogError unless the image has the size that the tables say."""
-    found = image_size(path)
-    if found != size:
-        message = f"the image is {found[0]}x{found[1]}, sample_data.json says {size[0]}x{size[1]}"
-        raise fault(path, message, "extract the image again from the data set's archive")
-
-
 COLUMNS = 5
 """float32: x, y, z in meters, intensity, ring."""
 _LARGEST = 100_000_000
@@ -146,30 +87,12 @@ OWN_CAR = 2.5
 _REMEDY = "extract the file again from the data set's archive, or read the log without lidar (data.log.lidar=false)"
 
 
-def check_sweep_size(path: Path) -> None:
-    """Raise LogError unless the file holds whole rows, of a number that a sweep can have."""
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise fault(path, f"the sweep cannot be read ({error})", _REMEDY) from error
-    if size % (4 * COLUMNS) or size > _LARGEST:
-        message = f"{size} bytes are no whole number of rows of {COLUMNS} float32, or more than {_LARGEST}"
-        raise fault(path, message, _REMEDY)
-
-
 def read_sweep(path: Path, world_from_lidar: Float64[Tensor, "4 4"]) -> Float64[Tensor, "n 3"]:
     """Points in nuScenes' world, without those of the recording car.
 
     The publisher has moved them by the car's own motion to the sweep's stamp. Raises LogError for a broken file.
     """
-    check_sweep_size(path)
-    try:
-        check_regular(path)
-        rows = np.fromfile(path, dtype="<f4").reshape(-1, COLUMNS)
-    except OSError as error:
-        raise fault(path, f"the sweep cannot be read ({error})", _REMEDY) from error
-    points = torch.from_numpy(rows[:, :3].astype(np.float64))
-    check_points(points, path, remedy=_REMEDY)
+    points = sensor_points(path, COLUMNS, max_bytes=_LARGEST, remedy=_REMEDY)
     return transform_points(world_from_lidar, points[points.norm(dim=1) >= OWN_CAR])
 
 
@@ -295,22 +218,27 @@ class NuScenesReader(RecordedReader):
         if problems := missing_files(file.path for file in files):
             raise LogError(problems)
         rig, shots = self._rig(), _shots(chosen)
-        if self._given is not None and (
-            problems := self._given.check((rig[shot.camera].name, shot.stem) for shot in shots)
+        if self.given is not None and (
+            problems := self.given.check((rig[shot.camera].name, shot.stem) for shot in shots)
         ):
             raise LogError(problems)
         boxes, notes = self._boxes()
         if far := check_extent(_placed(shots, boxes or ())):
             raise LogError(far)
         sizes = [recorded_size(chosen.images_of(camera.index)) for camera in rig]
-        pixels = ScenePixels(rig, sizes, chosen.scene.name, self._given)
+        egos = {camera.index: ego for camera in rig if (ego := ego_mask(chosen.scene.name, camera)) is not None}
+
+        def shipped(shot: RecordedImage) -> Masks:
+            return {"ego": egos[shot.camera]} if shot.camera in egos else {}
+
+        pixels = Pixels(rig, sizes, self.given, shipped, "sample_data.json says")
         return Recording(
             name=chosen.scene.name,
             rig=rig,
             shots=shots,
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=pixels.mask_kinds,
+            mask_kinds=frozenset(["ego"] if egos else ()).union(self.given.kinds if self.given else ()),
             # Behind the last image there are no frames.
             frame_stamps=tuple(chosen.instants.stamps[instant] for instant in chosen.window)[: 1 + shots[-1].frame],
             sweeps=self._sweeps(),
@@ -321,21 +249,7 @@ class NuScenesReader(RecordedReader):
         )
 
     def check_contents(self) -> list[Problem]:
-        chosen, problems = self._selection, []
-        for index, name in enumerate(chosen.cameras):
-            images = chosen.images_of(index)
-            for file in images:
-                attempt(problems, partial(check_size, file.path, recorded_size(images)))
-            wrong = {problem.path for problem in problems}
-            sound = [file.path for file in images if file.path not in wrong]
-            problems += check_camera_images(name, sound, (), decode=True)
-        if self._given is not None:
-            recording = self.recording()
-            for shot in recording.shots:
-                attempt(problems, partial(recording.read_masks, shot))
-        for sweep in (self._sweeps() or {}).values():
-            attempt(problems, sweep.read)
-        return problems
+        return check_recording(self.recording())
 
     def files(self) -> LogFiles:
         """Images and sweeps; ``data_hash`` adds the rows of the tables, which are those of many scenes."""
@@ -346,10 +260,6 @@ class NuScenesReader(RecordedReader):
         """Equal for the same scene in other tables too, as those of v1.0-mini and v1.0-trainval."""
         rows = json.dumps(self._selection.rows(), sort_keys=True)
         return hashlib.sha256(f"{hash_files(self.folder, self.files())}\n{rows}".encode()).hexdigest()[:12]
-
-    @property
-    def _given(self) -> GivenMasks | None:
-        return None if self.masks is None else GivenMasks(Path(self.masks))
 
     @cached_property
     def _selection(self) -> Selection:
@@ -365,18 +275,14 @@ class NuScenesReader(RecordedReader):
         )
 
     def _rig(self) -> list[RigCamera[str]]:
-        chosen = self._selection
-        return [
-            nuscenes_camera(
-                chosen.scene,
-                name,
-                index,
-                chosen.images_of(index),
-                width=self.width,
-                principal_shift=self.principal_shift,
-            )
-            for index, name in enumerate(chosen.cameras)
-        ]
+        """Pinholes: the publisher has taken the lens out of the images."""
+        chosen, rig = self._selection, []
+        for index, name in enumerate(chosen.cameras):
+            files = chosen.images_of(index)
+            intrinsics = torch.from_numpy(camera_intrinsics(chosen.scene, name, files).copy())
+            intrinsics[:2, 2] += self.principal_shift
+            rig.append(self.pinhole(name, index, intrinsics, recorded_size(files)))
+        return rig
 
     def _sweeps(self) -> dict[int, LidarSweep] | None:
         """None: there is no lidar, or it is not wanted."""

@@ -17,7 +17,7 @@ from sparsestreet.data.lidar import check_points
 from sparsestreet.data.poses import PosePath, check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording, check_recording
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import camera_at, middle, read_boxes, shutter
 from sparsestreet.data.waymo.segment import (
@@ -30,7 +30,7 @@ from sparsestreet.data.waymo.segment import (
     check_returns,
     world_points,
 )
-from sparsestreet.data.waymo.v1.segment import RecordSegment
+from sparsestreet.data.waymo.v1 import RecordSegment
 from sparsestreet.data.waymo.v2 import TableSegment
 
 _COMPONENTS = ("vehicle_pose", "camera_image", "camera_calibration", "lidar", "lidar_box")
@@ -39,16 +39,11 @@ _MAX_INDEX = 10**6
 """A number above is no place in a list but a name: Hydra takes the digits and underscores of one for a number."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """The segments of a folder, by name: files of version 1, folders of components of version 2."""
+def find_segments(root: Path) -> dict[str, Path]:
+    """The segments of a folder, by name: files of version 1, or folders of components of version 2.
 
-    version: int
-    places: Mapping[str, Path]
-
-
-def find_segments(root: Path) -> Found:
-    """Raise LogError for a folder that holds segments of neither version, or of both."""
+    Raises LogError for a folder that holds segments of neither version, or of both.
+    """
     if not root.is_dir():
         raise fault(root, "there is no such folder", "name the folder that holds Waymo's files (data.root)")
     records = {canonical(path.name): path for pattern in _RECORDS for path in sorted(root.glob(pattern))}
@@ -64,7 +59,7 @@ def find_segments(root: Path) -> Found:
     if not records and not tables:
         message = "it holds neither *.tfrecord (version 1) nor component/*.parquet (version 2), up to two folders deep"
         raise fault(root, message, "name the folder that holds Waymo's files (data.root)")
-    return Found(1, records) if records else Found(2, tables)
+    return records or tables
 
 
 def find_segment(root: Path, scene: str | int | None, scenes: Path | None) -> Segment:
@@ -77,14 +72,12 @@ def find_segment(root: Path, scene: str | int | None, scenes: Path | None) -> Se
 
     Raises LogError for files at fault, ValueError for a scene that is not there.
     """
-    found = find_segments(root)
-    name = _wanted(found, scene, scenes, root)
-    place = found.places[name]
-    return RecordSegment(place) if found.version == 1 else TableSegment(place, name)
+    places = find_segments(root)
+    name = _wanted(sorted(places), scene, scenes, root)
+    return TableSegment(places[name], name) if places[name].is_dir() else RecordSegment(places[name])
 
 
-def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Path) -> str:
-    names = sorted(found.places)
+def _wanted(names: Sequence[str], scene: str | int | None, scenes: Path | None, root: Path) -> str:
     shown = listed(names)
     if scene is None:
         if len(names) > 1:
@@ -96,7 +89,7 @@ def _wanted(found: Found, scene: str | int | None, scenes: Path | None, root: Pa
         name = next((name for name in names if name.replace("_", "") == str(scene)), str(scene))
     else:
         name = canonical(scene)
-    if name not in found.places:
+    if name not in names:
         raise ValueError(f"segment {name} is not in {root}: data.log.scene must be one of {shown}")
     return name
 
@@ -228,7 +221,7 @@ class WaymoReader(RecordedReader):
     def recording(self) -> Recording:
         segment, frames, cameras = self._segment, self._frames, self._cameras
         rig, shots, boxes, notes = self._rig(), *self._placed()
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
+        given = self.given
         if given is not None and (missing := given.check((cameras[shot.camera], shot.stem) for shot in shots)):
             raise LogError(missing)
         labelled = segment.labelled & {shot.key for shot in shots if given is None}
@@ -271,13 +264,7 @@ class WaymoReader(RecordedReader):
         return shots, boxes, notes
 
     def check_contents(self) -> list[Problem]:
-        recording, problems = self.recording(), self._segment.check_files()
-        for shot in recording.shots:
-            attempt(problems, partial(recording.read_image, shot))
-            attempt(problems, partial(recording.read_masks, shot))
-        for sweep in (recording.sweeps or {}).values():
-            attempt(problems, sweep.read)
-        return _once(problems)
+        return _once(self._segment.check_files() + check_recording(self.recording()))
 
     def files(self) -> LogFiles:
         """All components of the segment, lidar too where it is not wanted."""

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from sparsestreet.atomic import check_regular
 from sparsestreet.data.frame_cache import Lock
-from sparsestreet.data.problems import LogError, Problem, fault
+from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.reader import LogFiles
 from sparsestreet.data.waymo.segment import (
     CAMERAS,
@@ -349,7 +349,9 @@ class TableSegment(Segment):
         self.cameras = read_cameras(self._table("camera_calibration", "CameraCalibrationComponent"))
         table = self._optional("lidar_calibration", "LiDARCalibrationComponent")
         self.lidars = {} if table is None else read_lidars(table)
-        self.notes = self._absent()
+        if self.has_boxes and not self._path("lidar_camera_synced_box").is_file():
+            note = "no lidar_camera_synced_box: boxes are those of the lidar, each at the instant when it was scanned"
+            self.notes = (note,)
 
     def world_from_vehicle(self, frame: int) -> Float64[Tensor, "4 4"]:
         return transform(self._poses[self.stamps[frame]], self.source, f"frame {frame}: pose")
@@ -372,11 +374,11 @@ class TableSegment(Segment):
     @cached_property
     def labelled(self) -> frozenset[tuple[int, str]]:
         numbers = {stamp: frame for frame, stamp in enumerate(self.stamps)}
-        return frozenset((numbers[stamp], name) for stamp, name in self._divisors if stamp in numbers)
+        return frozenset((numbers[stamp], name) for stamp, name in self._label_rows if stamp in numbers)
 
     def panoptic(self, frame: int, camera: str) -> tuple[bytes, int]:
         key = self.stamps[frame], camera
-        return self._read_label(key), self._divisors[key]
+        return self._read_label(key), self._label_rows[key][1]
 
     def has_returns(self, frame: int) -> bool:
         return any((self.stamps[frame], name) in self._return_places for name in LIDARS.values())
@@ -393,9 +395,6 @@ class TableSegment(Segment):
         described = ["vehicle_pose", "camera_calibration", "lidar_calibration", "lidar_box", "lidar_camera_synced_box"]
         recorded = ["camera_image", "camera_segmentation", "lidar", "lidar_pose"]
         return LogFiles([self._path(name) for name in described], [self._path(name) for name in recorded])
-
-    def check_files(self) -> list[Problem]:
-        return []
 
     @cached_property
     def _images(self) -> Table:
@@ -433,24 +432,24 @@ class TableSegment(Segment):
         return found
 
     @cached_property
-    def _segmentation(self) -> tuple[Table | None, dict[tuple[int, str], tuple[int, int]]]:
-        """The table, and row and divisor of each labelled image."""
-        table = self._optional("camera_segmentation", "CameraSegmentationLabelComponent")
-        rows = [] if table is None else table.rows([FRAME, CAMERA], [DIVISOR])
-        path = self._path("camera_segmentation")
-        keys = [(row[FRAME], sensor(row[CAMERA], CAMERAS, path)) for row in rows]
-        divisors = [int(numbers(row, [DIVISOR], path)[0]) for row in rows]
-        return table, {key: (place, divisors[place]) for place, key in enumerate(keys)}
+    def _segmentation(self) -> Table | None:
+        return self._optional("camera_segmentation", "CameraSegmentationLabelComponent")
 
     @cached_property
-    def _divisors(self) -> dict[tuple[int, str], int]:
-        return {key: divisor for key, (_, divisor) in self._segmentation[1].items()}
+    def _label_rows(self) -> dict[tuple[int, str], tuple[int, int]]:
+        """Row and divisor of each labelled image."""
+        rows = [] if self._segmentation is None else self._segmentation.rows([FRAME, CAMERA], [DIVISOR])
+        path = self.label_file
+        return {
+            (row[FRAME], sensor(row[CAMERA], CAMERAS, path)): (place, int(numbers(row, [DIVISOR], path)[0]))
+            for place, row in enumerate(rows)
+        }
 
     @cached_property
     def _read_label(self) -> Callable[[Any], bytes]:
-        table, rows = self._segmentation
+        table = self._segmentation
         assert table is not None  # it has the rows that are asked for
-        places = {key: place for key, (place, _) in rows.items()}
+        places = {key: place for key, (place, _) in self._label_rows.items()}
         return table.spooled(places, [LABEL], lambda cells: data_of(cells[0], table.path))
 
     @cached_property
@@ -485,14 +484,6 @@ class TableSegment(Segment):
     def _places(self, table: Table) -> dict[tuple[int, str], int]:
         rows = table.rows([FRAME, LASER], [])
         return {(row[FRAME], sensor(row[LASER], LIDARS, table.path)): n for n, row in enumerate(rows)}
-
-    def _absent(self) -> tuple[str, ...]:
-        optional = ("lidar_camera_synced_box",) if self.has_boxes else ()
-        return tuple(
-            f"no {name}: boxes are those of the lidar, each at the instant when it was scanned"
-            for name in optional
-            if not self._path(name).is_file()
-        )
 
     def _check_name(self, rows: Sequence[dict[str, Any]]) -> None:
         others = {row[SEGMENT] for row in rows} - {self.name}

@@ -71,13 +71,11 @@ def test_a_window_takes_its_own_frames(tmp_path):
 def test_without_the_folder_or_when_asked_there_are_no_bodies(tmp_path):
     root = make_nuscenes(tmp_path, frames=FRAMES)
     assert DriveStudioReader(root).read().tracks[0].body is None
-    write_people(root, {0: person()})
+    write_people(root, {})  # an object without a person
+    assert DriveStudioReader(root).read().tracks[0].body is None
+    joblib.dump({0: person()}, root / "humanpose/smpl.pkl")
     assert DriveStudioReader(root, bodies=False).read().tracks[0].body is None
     assert DriveStudioReader(root).read().tracks[0].body is not None
-
-
-def test_an_object_without_a_person_has_no_body(tmp_path):
-    assert DriveStudioReader(write_people(make_nuscenes(tmp_path, frames=FRAMES), {})).read().tracks[0].body is None
 
 
 def test_a_pose_without_a_box_is_left_out_with_a_note(tmp_path):
@@ -124,7 +122,7 @@ def test_what_is_wrong_is_found_before_anything_is_read(change, message, tmp_pat
     assert len(reader.check()) == 1
 
 
-def test_a_hostile_file_is_refused(tmp_path):
+def test_a_hostile_file_and_a_missing_one_are_refused(tmp_path):
     class Hostile:
         def __reduce__(self):
             return Path.touch, (tmp_path / "it_ran",)
@@ -133,10 +131,6 @@ def test_a_hostile_file_is_refused(tmp_path):
     with pytest.raises(LogError, match="must be a pickle of plain values and arrays"):
         DriveStudioReader(root).read()
     assert not (tmp_path / "it_ran").exists()
-
-
-def test_an_empty_folder_is_a_missing_file(tmp_path):
-    root = make_nuscenes(tmp_path, frames=FRAMES)
-    (root / "humanpose").mkdir()
+    (root / "humanpose/smpl.pkl").unlink()
     with pytest.raises(LogError, match=r"smpl.pkl: the file is missing"):
         DriveStudioReader(root).read()

@@ -14,7 +14,6 @@ from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.drivestudio.layout import find_layout
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
-from sparsestreet.data.reader import LogFiles, hash_files
 from tests.data.drivestudio.folders import (
     HEIGHT,
     WIDTH,
@@ -104,32 +103,19 @@ CORRUPTIONS = {
         "ego_masks/0.png",
         "the mask is 4x3",
     ),
-    "more sweeps than images": (
-        lambda root: shutil.copy(root / "lidar/002.bin", root / "lidar/003.bin"),
-        "images/003_0.jpg",
-        "missing",
-    ),
     "pose of 3x4": (text("lidar_pose/000.txt", "1 0 0 0\n0 1 0 0\n0 0 1 0\n"), "lidar_pose/000.txt", "4x4"),
     "ragged pose": (text("lidar_pose/000.txt", "1 0 0 0\n0 1\n"), "lidar_pose/000.txt", "no table"),
-    "empty pose": (text("lidar_pose/000.txt", ""), "lidar_pose/000.txt", "4x4"),
     "words for a pose": (text("lidar_pose/000.txt", "a b\nc d\n"), "lidar_pose/000.txt", "no table"),
-    "scaled pose": (edit_matrix("extrinsics/001_0.txt", put(0, 2, 1.01)), "extrinsics/001_0.txt", "rigid"),
     "mirrored pose": (edit_matrix("extrinsics/001_0.txt", mirror), "extrinsics/001_0.txt", "rigid"),
-    "last row": (edit_matrix("extrinsics/001_0.txt", put(3, 0, 0.5)), "extrinsics/001_0.txt", "rigid"),
-    "NaN pose": (edit_matrix("extrinsics/001_0.txt", put(1, 3, np.nan)), "extrinsics/001_0.txt", "NaN"),
     "stray pose": (edit_matrix("extrinsics/001_1.txt", put(1, 3, 2.5e4)), "extrinsics/001_1.txt", "25.0 km"),
     "other image size": (image("images/001_0.jpg", HEIGHT, WIDTH + 1), "images/001_0.jpg", f"{WIDTH + 1}x{HEIGHT}"),
     "other mask size": (image("sky_masks/001_0.png", 12, 20), "sky_masks/001_0.png", "20x12"),
     "cut image": (truncate("images/001_0.jpg", -20), "images/001_0.jpg", "decoded"),
-    "no image": (text("images/001_0.jpg", "hello"), "images/001_0.jpg", "decoded"),
-    "cut mask": (truncate("sky_masks/001_0.png", 60), "sky_masks/001_0.png", "decoded"),
     "eight intrinsics": (intrinsics([40.0, 40, 20, 12, 0, 0, 0, 0]), "intrinsics/1.txt", "9 numbers"),
     "negative focal length": (intrinsics([-40.0, 40, 20, 12, 0, 0, 0, 0, 0]), "intrinsics/1.txt", "positive"),
-    "NaN focal length": (intrinsics([np.nan, 40, 20, 12, 0, 0, 0, 0, 0]), "intrinsics/1.txt", "positive"),
     "lens without inverse": (intrinsics([40.0, 40, 20, 12, 0, 0, 1, 1, 0]), "intrinsics/1.txt", "no inverse"),
     "half a lidar row": (truncate("lidar/001.bin", 24), "lidar/001.bin", "24 bytes"),
     "NaN lidar point": (points(np.nan), "lidar/001.bin", "1 of 2 points"),
-    "far lidar point": (points(2e3), "lidar/001.bin", "1 of 2 points"),
     "broken JSON": (text(INFO, '{"0": '), INFO, "no JSON"),
     "list for JSON": (text(INFO, "[]"), INFO, "list"),
     "object without boxes": (text(INFO, '{"0": {"class_name": "Vehicle"}}'), INFO, "cannot be read"),
@@ -139,13 +125,9 @@ CORRUPTIONS = {
     "negative box": (boxes(box_size=[[4, -2, 1.5]] * 3), INFO, "-2.0"),
     "infinite box": (boxes(box_size=[[4, np.inf, 1.5]] * 3), INFO, "box of"),
     "unsorted frames": (boxes(frame_idx=[0, 2, 1]), INFO, "increasing"),
-    "repeated frames": (boxes(frame_idx=[0, 1, 1]), INFO, "increasing"),
     "frame behind the end": (boxes(frame_idx=[0, 1, 3]), INFO, "ends at 2"),
-    "NaN box pose": (boxes(obj_to_world=[np.full((4, 4), np.nan).tolist()] * 3), INFO, "NaN"),
     "scaled box pose": (boxes(obj_to_world=[np.diag([2.0, 1, 1, 1]).tolist()] * 3), INFO, "rigid"),
     "too few stamps": (text("timestamps.txt", "0.0\n0.1\n"), "timestamps.txt", "3 stamps, got 2"),
-    "stamps out of order": (text("timestamps.txt", "0.0\n0.2\n0.1\n"), "timestamps.txt", "must increase"),
-    "a stamp that is no number": (text("timestamps.txt", "0.0\n0,1\n0.2\n"), "timestamps.txt", "'0,1' is no number"),
     "a folder for a clock": (
         lambda root: (root / "timestamps.txt").rename(root / "old.txt") and (root / "timestamps.txt").mkdir(),
         "timestamps.txt",
@@ -155,7 +137,7 @@ CORRUPTIONS = {
     "fine masks for one class": (
         lambda root: shutil.copytree(root / "dynamic_masks/human", root / "fine_dynamic_masks/human"),
         "fine_dynamic_masks/vehicle/000_0.png",
-        "6 files",
+        "6 files of the folder are missing: 000_0.png, 000_1.png, 001_0.png, 001_1.png, 002_0.png, ...",
     ),
 }
 
@@ -190,6 +172,7 @@ def test_the_broken_file_is_named_and_the_reader_refuses_it(name, tmp_path):
     corrupt, file, fragment = CORRUPTIONS[name]
     corrupt(make_nuscenes(tmp_path))
     problems = DriveStudioReader(tmp_path).check()
+    assert len(problems) == 1
     assert file in [problem.path.relative_to(tmp_path).as_posix() for problem in problems]
     assert fragment in " ".join(problem.message for problem in problems)
     assert all(problem.remedy for problem in problems)
@@ -232,20 +215,14 @@ def test_bytes_behind_the_end_of_an_image_do_no_harm(tmp_path):
     assert DriveStudioReader(tmp_path).read().frames[2].sky.any()
 
 
-@pytest.mark.parametrize("name", sorted(set(CORRUPTIONS) - {"more sweeps than images"}))
-def test_one_fault_is_one_problem(name, tmp_path):
-    CORRUPTIONS[name][0](make_nuscenes(tmp_path))
-    assert len(DriveStudioReader(tmp_path).check()) == 1
-
-
 def test_all_problems_are_found_at_once(tmp_path):
     make_nuscenes(tmp_path)
-    names = ["missing image", "mirrored pose", "cut mask", "NaN lidar point", "negative focal length", "negative box"]
+    names = ["missing image", "mirrored pose", "other mask size", "NaN lidar point", "negative box"]
     for name in names:
         CORRUPTIONS[name][0](tmp_path)
     found = {problem.path.relative_to(tmp_path).as_posix() for problem in DriveStudioReader(tmp_path).check()}
     assert found == {CORRUPTIONS[name][1] for name in names}
-    with pytest.raises(LogError, match="5 problems"):  # points are only read once the rest is sound
+    with pytest.raises(LogError, match="4 problems"):  # points are only read once the rest is sound
         DriveStudioReader(tmp_path).read()
 
 
@@ -267,35 +244,11 @@ def test_the_waymo_flavor_is_checked_by_its_own_files(tmp_path):
     assert found == {"ego_pose/001.txt", "extrinsics/1.txt", "ego_pose/002.txt", "lidar/000.bin"}
 
 
-def test_missing_files_of_one_folder_are_one_problem(tmp_path):
-    make_nuscenes(tmp_path, frames=8)
-    for frame in range(1, 8):
-        remove(f"lidar/{frame:03d}.bin")(tmp_path)
-    (problem,) = DriveStudioReader(tmp_path).check()
-    assert problem.path == tmp_path / "lidar/001.bin"
-    assert problem.message == ("7 files of the folder are missing: 001.bin, 002.bin, 003.bin, 004.bin, 005.bin, ...")
-
-
 def test_what_is_not_read_is_not_checked(tmp_path):
     make_nuscenes(tmp_path)
     CORRUPTIONS["cut image"][0](tmp_path)
     CORRUPTIONS["negative focal length"][0](tmp_path)
     assert DriveStudioReader(tmp_path, cameras=[0], first_frame=2).check() == []
-
-
-@pytest.mark.parametrize("build", [lambda root: None, lambda root: (root / "images").mkdir()])
-def test_a_folder_that_is_no_log_is_one_problem(build, tmp_path):
-    build(tmp_path)
-    assert len(DriveStudioReader(tmp_path).check()) == 1
-    with pytest.raises(LogError):
-        DriveStudioReader(tmp_path).read()
-
-
-def test_a_publishers_own_files_are_sent_to_the_reader_of_theirs(tmp_path):
-    (tmp_path / "v1.0-mini").mkdir()
-    (tmp_path / "v1.0-mini/sample_data.json").touch()
-    (problem,) = DriveStudioReader(tmp_path).check()
-    assert "data=auto" in problem.remedy
 
 
 @pytest.mark.parametrize(
@@ -316,6 +269,7 @@ def test_what_is_no_scene_is_told_apart(named, words, tmp_path):
     assert problem.path == tmp_path / named
     assert words in problem.message
     assert ("007" in problem.remedy) == (named == "")
+    assert ("data=auto" in problem.remedy) == (named == "empty")
 
 
 @pytest.mark.parametrize(
@@ -379,7 +333,7 @@ def hash_of(root: Path, **choice: Any) -> str:
     return DriveStudioReader(root, **choice).data_hash()
 
 
-def flip(path: Path, place: int = 0) -> None:
+def flip(path: Path, place: int) -> None:
     """Another byte, at the same size."""
     content = bytearray(path.read_bytes())
     content[place] ^= 1
@@ -396,26 +350,19 @@ def test_a_copy_has_the_same_hash_and_so_has_one_with_files_that_nobody_reads(ma
     assert hash_of(tmp_path / "copy") == before
 
 
-READ = [
+READ = (
     "images/001_1.jpg", "sky_masks/002_0.png", "dynamic_masks/human/000_1.png", "lidar/002.bin", "intrinsics/1.txt",
     "instances/instances_info.json", "timestamps.txt",
-]  # fmt: skip
+)  # fmt: skip
 
 
-@FLAVORS
-@pytest.mark.parametrize("name", READ)
-def test_every_kind_of_file_that_is_read_counts(make, name, tmp_path):
-    before = hash_of(make(tmp_path))
-    flip(tmp_path / name, -3)
-    assert hash_of(tmp_path) != before
-
-
-def test_poses_of_either_flavor_count(tmp_path):
-    for make, name in ((make_nuscenes, "extrinsics/001_0.txt"), (make_waymo, "ego_pose/001.txt")):
-        root = make(tmp_path / make.__name__)
-        before = hash_of(root)
-        flip(root / name, -3)
-        assert hash_of(root) != before
+@pytest.mark.parametrize(("make", "pose"), [(make_nuscenes, "extrinsics/001_0.txt"), (make_waymo, "ego_pose/001.txt")])
+def test_every_kind_of_file_that_is_read_counts(make, pose, tmp_path):
+    hashes = {hash_of(make(tmp_path))}
+    for name in (*READ, pose):
+        flip(tmp_path / name, -3)
+        hashes.add(hash_of(tmp_path))
+    assert len(hashes) == len(READ) + 2
 
 
 @pytest.mark.parametrize(
@@ -440,15 +387,6 @@ def test_a_run_without_lidar_bodies_or_resolution_is_of_the_same_log(make, tmp_p
     """A report compares such runs, and would say that their data differ."""
     before = hash_of(make(tmp_path))
     assert hash_of(tmp_path, lidar=False, bodies=False, width=20) == before
-
-
-def test_of_boxes_and_poses_every_byte_counts(tmp_path):
-    """Also of more than are read at a time."""
-    boxes = tmp_path / "boxes.json"
-    boxes.write_bytes(bytes(2_500_000))
-    before = hash_files(tmp_path, LogFiles(described=[boxes]))
-    flip(boxes, 1_250_000)
-    assert hash_files(tmp_path, LogFiles(described=[boxes])) != before
 
 
 def test_large_files_are_not_read(tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """Which data set's flavor a folder has: the street is the same, whichever layout tells it, or the folder is refused."""
 
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,28 +60,21 @@ def test_mounted_cameras_with_opencv_axes_are_told_by_their_mounts(columns, lida
     assert log.notes[0] == f"read as data.log.flavor={name}: mounted cameras, OpenCV's axes{rows}"
 
 
-def test_poses_of_images_beside_poses_of_the_vehicle_are_pandasets(tmp_path):
-    log = DriveStudioReader(make_pandaset(tmp_path / "a")).read()
-    assert_same_street(log, DriveStudioReader(make_nuscenes(tmp_path / "b")).read())
-    assert log.notes[0] == (
-        "read as data.log.flavor=pandaset: a pose for each image, OpenCV's axes, lidar rows of 5 numbers"
-    )
-
-
 @pytest.mark.parametrize(
-    ("make", "name"),
+    ("make", "name", "same"),
     [
-        (make_waymo, "waymo"),
-        (make_nuscenes, "nuscenes"),
-        (make_mounted_opencv, "kitti"),
-        (make_mounted_opencv, "argoverse"),
-        (make_pandaset, "pandaset"),
+        (make_waymo, "waymo", make_waymo),
+        (make_nuscenes, "nuscenes", make_nuscenes),
+        (make_mounted_opencv, "argoverse", make_waymo),
+        (make_pandaset, "pandaset", make_nuscenes),
     ],
 )
-def test_a_flavor_may_be_named(make, name, tmp_path):
-    log = DriveStudioReader(make(tmp_path), flavor=name).read()
-    assert_same_street(log, DriveStudioReader(tmp_path).read())
-    assert not [note for note in log.notes if "data.log.flavor" in note and name in ("waymo", "nuscenes")]
+def test_a_flavor_may_be_named(make, name, same, tmp_path):
+    said = [] if name in ("waymo", "nuscenes") else [f"read as data.log.flavor={name}"]
+    log = DriveStudioReader(make(tmp_path / "a"), flavor=name).read()
+    assert_same_street(log, DriveStudioReader(tmp_path / "a").read())
+    assert_same_street(log, DriveStudioReader(same(tmp_path / "b")).read())
+    assert [note.split(":")[0] for note in log.notes if "data.log.flavor" in note] == said
 
 
 @pytest.mark.parametrize(
@@ -106,15 +98,11 @@ def tilt(degrees: float) -> np.ndarray:
     return np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
 
 
-def test_tilted_cameras_are_still_told(tmp_path):
+def test_cameras_that_leave_it_open_are_refused_until_the_flavor_is_named(tmp_path):
+    """A tilted one is told; one that looks straight down has neither axis upright, nor may cameras of one differ."""
     make_waymo(tmp_path)
     write_matrix(tmp_path / "extrinsics/1.txt", pose(tilt(40.0), np.zeros(3)))
     assert not [note for note in DriveStudioReader(tmp_path).read().notes if "flavor" in note]
-
-
-def test_cameras_that_leave_it_open_are_refused_until_the_flavor_is_named(tmp_path):
-    """One that looks straight down has neither axis upright; nor may cameras of one vehicle differ."""
-    make_waymo(tmp_path)
     write_matrix(tmp_path / "extrinsics/1.txt", pose(tilt(90.0), np.zeros(3)))
     with pytest.raises(LogError, match=r"name the flavor, data\.log\.flavor=waymo, nuscenes, kitti") as refused:
         DriveStudioReader(tmp_path).read()
@@ -223,14 +211,6 @@ def test_no_loss_sees_what_the_lens_did_not_record(tmp_path):
     assert DriveStudioReader(tmp_path).read().frames[3].ego is None
 
 
-def test_lidar_meets_a_pinhole_where_the_lens_is_taken_out(bent):
-    """(10, 2, 0.75) is 9 m ahead of camera 1 at frame 1, 1.5 m to its left and 0.75 m below it."""
-    (bent / "ego_masks/1.png").unlink()
-    frame = DriveStudioReader(bent, undistort=True).read().frames[4]
-    column, row = WIDTH / 2 - FOCAL * 1.5 / 9, HEIGHT / 2 + FOCAL * 0.75 / 9
-    assert float(frame.depth[int(row), int(column)]) == pytest.approx(9.0)
-
-
 def test_returns_ahead_of_the_vehicle(tmp_path):
     """At frame 1 the points lie 9, 19, 7, -6 and 9 m ahead of it."""
     root = make_waymo(tmp_path / "waymo")
@@ -286,15 +266,8 @@ def log(kitti: Path) -> DrivingLog:
     return DriveStudioReader(kitti).read()
 
 
-def test_it_is_sound_and_quick_to_read(kitti):
+def test_it_is_sound_and_holds_what_its_description_says(kitti, log):
     assert DriveStudioReader(kitti).check() == []
-    start = time.process_time()
-    DriveStudioReader(kitti).read()
-    # 0.8 s of one thread, 1.1 s with shape checks; CPU time, since a wall clock would measure the neighbors.
-    assert time.process_time() - start < 3
-
-
-def test_it_holds_what_its_description_says(log):
     assert (log.num_frames, log.num_cameras, len(log.tracks), len(log.sweeps)) == (60, 2, 12, 60)
     assert log.frames[0].image.shape == (120, 397, 3)
     assert {track.class_name for track in log.tracks} == {"Car", "Cyclist", "Tram"}
@@ -354,15 +327,6 @@ def test_colors_carried_five_frames_by_the_poses_fit_better_than_with_poses_one_
     carried = mean_difference(log, 5, 0, (5, 0))
     assert mean_difference(log, 5, 0, (6, 0)) > 1.2 * carried
     assert mean_difference(log, 5, 0, (4, 0)) > 1.2 * carried
-
-
-def test_depth_is_that_of_the_nearest_lidar_point(log):
-    frame = log.frames[40]
-    _, pixels, depths = visible_pixels(frame.camera, log.sweeps[20].points)
-    image = frame.depth.flatten()
-    assert (image[pixels] <= depths).all()
-    assert torch.isin(image[image > 0], depths).all()
-    assert len(pixels.unique()) == int((image > 0).sum())
 
 
 def test_boxes_hold_lidar_points_and_stand_on_the_ground(log):

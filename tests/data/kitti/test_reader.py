@@ -11,7 +11,6 @@ from sparsestreet.data.kitti import KittiReader
 from sparsestreet.data.kitti.files import point_stamps, read_stamps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import Recording
-from sparsestreet.geometry.cameras import inverse, transform_points
 from tests.data.kitti.write import CAMERAS, DRIVE, lidar_from_camera, write_kitti
 from tests.data.plan import Plan, moved, pose, turned
 from tests.shared import made_once
@@ -60,6 +59,9 @@ def test_cameras_are_where_they_were(recording, shift):
         assert shot.stamp == stamp
     assert [(shot.frame, shot.camera) for shot in recording.shots] == [(f, c) for f in range(4) for c in range(2)]
     assert recording.frame_stamps == tuple(PLAN.stamps.tolist())
+    for camera in recording.rig:
+        assert np.abs(camera.intrinsics.numpy() - PLAN.cameras[0].intrinsics).max() < 1e-5  # float32
+        assert camera.distortion is None
 
 
 def test_the_vehicle_is_the_imu(recording, shift):
@@ -70,12 +72,6 @@ def test_the_vehicle_is_the_imu(recording, shift):
         wanted[:3, 3] += shift
         assert np.abs(found[:3, :3] - wanted[:3, :3]).max() < 1e-9
         assert np.abs(found[:3, 3] - wanted[:3, 3]).max() < 3
-
-
-def test_intrinsics_count_from_the_corner_of_the_image(recording):
-    for camera in recording.rig:
-        assert np.abs(camera.intrinsics.numpy() - PLAN.cameras[0].intrinsics).max() < 1e-5  # float32
-        assert camera.distortion is None
 
 
 def test_points_are_where_the_street_was(recording, shift):
@@ -175,19 +171,11 @@ def test_its_hash_is_of_what_it_reads(root, tmp_path):
     assert KittiReader(root=tmp_path, drive=DRIVE).data_hash() != reader.data_hash()
 
 
-def test_the_baseline_of_its_cameras_is_exact(recording):
-    """image_03 lies 0.533 m to the right of image_02 in its own axes, 3.2 mm lower."""
-    left, right = (shot.world_from_camera for shot in recording.shots[:2])
-    between = transform_points(inverse(left), right[None, :3, 3])[0].numpy()
-    assert between == pytest.approx([0.0599 + 0.4731, -0.0004 - 0.0028, 0.0], abs=POSITION)
-
-
 @pytest.mark.parametrize(
     ("text", "stamp"),
     [
         # GNU date: date -u -d "2011-09-26 13:04:32" +%s
         ("2011-09-26 13:04:32.345323776", 1_317_042_272_345_323_776),
-        ("2011-09-26 13:04:32.3453", 1_317_042_272_345_300_000),
         ("2011-09-26 13:04:32", 1_317_042_272_000_000_000),
         ("2012-02-29 23:59:59.000000001", 1_330_559_999_000_000_001),
     ],

@@ -49,20 +49,15 @@ def test_the_vehicle_is_where_it_was_at_the_images_of_the_first_camera(recording
     assert np.allclose(recording.vehicle.poses, PLAN.world_from_vehicle(stamps), rtol=0, atol=1e-11)
 
 
-def test_intrinsics_have_pixel_centers_at_a_half(recording):
+def test_intrinsics_have_pixel_centers_at_a_half(drive, recording):
     for camera, planned in zip(recording.rig, PLAN.cameras, strict=True):
         assert (camera.name, camera.size, camera.distortion) == (CHANNELS[planned.name], (32, 24), None)
         assert np.allclose(camera.intrinsics, planned.intrinsics, rtol=1e-7)
-
-
-def test_a_principal_point_may_be_taken_as_it_is(drive):
-    rig = NuScenesReader(root=drive.root, principal_shift=0).recording().rig
-    assert rig[0].intrinsics[:2, 2].tolist() == [15.75, 11.0]
-
-
-def test_a_width_scales_shifted_intrinsics(drive):
-    rig = NuScenesReader(root=drive.root, width=16).recording().rig
-    assert rig[0].intrinsics[0].tolist() == [15.0, 0.0, 8.125]
+    as_it_is = NuScenesReader(root=drive.root, principal_shift=0).recording().rig
+    assert as_it_is[0].intrinsics[:2, 2].tolist() == [15.75, 11.0]
+    half = NuScenesReader(root=drive.root, width=16, lidar=False).recording()
+    assert half.rig[0].intrinsics[0].tolist() == [15.0, 0.0, 8.125]
+    assert half.sweeps is None
 
 
 def test_boxes_are_those_of_the_keyframes_at_their_stamps(recording):
@@ -81,13 +76,6 @@ def test_returns_are_where_they_were_and_the_own_car_has_none(recording):
         assert np.allclose(points, PLAN.world_points(frame), rtol=0, atol=1e-5)
 
 
-def test_pixels_are_those_of_the_files(recording):
-    for shot in recording.shots:
-        pixels = recording.read_image(shot).numpy().astype(int)
-        # JPEG of quality 98.
-        assert abs(pixels - PLAN.image(shot.frame, PLAN.cameras[shot.camera])).max() <= 6
-
-
 def test_the_log_that_follows(drive):
     log = NuScenesReader(root=drive.root).read()
     assert (log.name, log.num_frames, log.num_cameras, len(log.sweeps)) == ("scene-0061", 4, 2, 4)
@@ -96,6 +84,10 @@ def test_the_log_that_follows(drive):
     start = PLAN.world_from_camera(0, PLAN.cameras[0])[:3, 3]
     assert np.allclose(log.dataset_from_world[:3, 3], start, rtol=0, atol=1e-11)
     assert torch.allclose(log.frames[0].camera.position, torch.zeros(3), atol=1e-6)
+    for frame in log.frames:
+        index, camera = frame.indices
+        # JPEG of quality 98.
+        assert abs(frame.image.numpy().astype(int) - PLAN.image(index, PLAN.cameras[camera])).max() <= 6
     assert NuScenesReader(root=drive.root).check() == []
 
 
@@ -142,10 +134,6 @@ def test_a_window_keeps_boxes_outside_of_it_apart(sparse):
     assert boxes.frames.tolist() == [-2, 1, 4]
 
 
-def test_without_lidar(drive):
-    assert NuScenesReader(root=drive.root, lidar=False).recording().sweeps is None
-
-
 def test_an_image_that_the_tables_lack(tmp_path):
     drive = write_nuscenes(tmp_path / "drive", PLAN)
     gone = token("file", "scene-0061", "CAM_FRONT_LEFT", 3)
@@ -166,10 +154,6 @@ def test_objects_that_no_return_hit_are_left_out(tmp_path):
     drive.edit("sample_annotation", lambda rows: rows[2].update(num_radar_pts=1))
     (boxes,) = there(NuScenesReader(root=drive.root).recording().boxes)
     assert len(boxes.frames) == 4
-
-
-def test_a_set_without_annotations(tmp_path):
-    drive = write_nuscenes(tmp_path / "drive", PLAN)
     drive.write("sample_annotation", [])
     assert NuScenesReader(root=drive.root).recording().boxes is None
     assert NuScenesReader(root=drive.root).read().tracks == ()
@@ -185,6 +169,13 @@ def test_the_lowest_rows_of_the_back_camera_show_the_car(scene, rows, tmp_path):
     # 80 of 900 rows, or 146: 2.1 of 24, or 3.9, so three rows or four hold some of them.
     assert there(back.ego).any(1).tolist() == [False] * (24 - rows) + [True] * rows
     assert log.frames[0].ego is None
+    # Masks that somebody made of another kind leave it.
+    for frame in range(4):
+        path = tmp_path / "masks/sky/CAM_BACK" / f"{drive.file('CAM_FRONT_LEFT', frame).stem}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (32, 24)).save(path)
+    given = NuScenesReader(root=drive.root, masks=tmp_path / "masks").read().frames[1]
+    assert torch.equal(there(given.ego), there(back.ego))
 
 
 def test_the_hash_is_of_the_scene_in_whatever_tables(drive, tmp_path):

@@ -29,18 +29,12 @@ def drive(tmp_path_factory) -> Written:
     return written
 
 
-def note(drive: Written, scene: str | int) -> str:
-    return NuScenesReader(root=drive.root, scene=scene).recording().notes[0]
-
-
-def test_by_name(drive):
-    assert note(drive, "scene-0061") == "scene-0061 is read, at place 1 of v1.0-mini/scene.json"
-
-
-def test_by_place_the_other_meaning_of_the_number_is_said(drive):
-    assert note(drive, 1) == (
-        "scene-0061 is read, at place 1 of v1.0-mini/scene.json, as data.log.scene=1 asks (DriveStudio counts so); for "
-        "the scene whose name has this number say data.log.scene=scene-0001"
+def test_by_name_or_by_place_whose_other_meaning_is_said(drive):
+    said = "scene-0061 is read, at place 1 of v1.0-mini/scene.json"
+    assert NuScenesReader(root=drive.root, scene="scene-0061").recording().notes[0] == said
+    assert NuScenesReader(root=drive.root, scene=1).recording().notes[0] == (
+        f"{said}, as data.log.scene=1 asks (DriveStudio counts so); for the scene whose name has this number say "
+        "data.log.scene=scene-0001"
     )
 
 
@@ -134,13 +128,11 @@ def test_the_six_images_of_a_turn_and_its_sweep_are_one_instant(jitter):
     assert instants.of_samples == {0: 0, 1: 6, 2: 12, 3: 18}
 
 
-def test_an_image_that_was_dropped_leaves_a_hole():
+def test_images_that_were_dropped():
+    """One leaves a hole; without its front image an instant is gone, and its images are counted."""
     instants = find_instants(rig(drop=("CAM_BACK", 8)), "all")
     assert (8, "CAM_BACK") not in instants.images
     assert len(instants.images) == 143
-
-
-def test_without_its_front_image_an_instant_is_gone_and_its_images_are_counted():
     instants = find_instants(rig(drop=("CAM_FRONT", 8)), "all")
     assert (len(instants.stamps), len(instants.images), instants.without_instant) == (23, 138, 5)
 
@@ -179,12 +171,6 @@ def test_rows_are_those_of_the_standard_parser(options, chunk, tmp_path, monkeyp
     assert rows_of_tokens(tmp_path / "t.json", {"t17"})["t17"].values == rows[17]
 
 
-def test_an_empty_list_is_a_table(tmp_path):
-    (tmp_path / "t.json").write_text(" [ \n ] \n")
-    assert rows_where(tmp_path / "t.json", "token", {"t"}) == []
-    assert all_rows(tmp_path / "t.json") == []
-
-
 def test_memory_is_that_of_the_rows_found(tmp_path, monkeypatch):
     """A table of 2.4 MB in pieces of 16 kB: what is held is a few pieces and one row."""
     monkeypatch.setattr(tables, "_CHUNK", 1 << 14)
@@ -221,7 +207,10 @@ def test_what_is_no_table_of_flat_rows_is_refused(text, said, tmp_path):
     assert caught.value.problems[0].path == tmp_path / "t.json"
 
 
-def test_a_table_that_is_parsed_at_once_has_a_limit(tmp_path):
+def test_a_table_may_be_empty_and_one_that_is_parsed_at_once_has_a_limit(tmp_path):
+    (tmp_path / "t.json").write_text(" [ \n ] \n")
+    assert rows_where(tmp_path / "t.json", "token", {"t"}) == []
+    assert all_rows(tmp_path / "t.json") == []
     with (tmp_path / "t.json").open("wb") as file:
         file.truncate(1 << 30)
     with pytest.raises(LogError, match="the table has 1073741824 bytes, more than 67108864"):

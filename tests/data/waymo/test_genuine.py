@@ -8,13 +8,10 @@ import pytest
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.waymo import WaymoReader
 from sparsestreet.data.waymo.boxes import middle, readout
-from sparsestreet.data.waymo.v1.segment import RecordSegment
+from sparsestreet.data.waymo.v1 import RecordSegment
 from sparsestreet.data.waymo.v2 import Table, matrix
-from tests.data.waymo import records, tables
-from tests.data.waymo.drive import Drive
-from tests.data.waymo.records import NAME
-from tests.data.waymo.tables import FRAME, LASER, SEGMENT, Row
-from tests.typed import there
+from tests.data.waymo import records
+from tests.data.waymo.tables import FRAME, SEGMENT
 
 ALL = ["FRONT", "FRONT_LEFT", "FRONT_RIGHT", "SIDE_LEFT", "SIDE_RIGHT"]
 SIZES = [(1920, 1280)] * 3 + [(1920, 886)] * 2
@@ -135,36 +132,3 @@ def test_waymo_own_messages_say_the_same(packed, drive, tmp_path):
         *(theirs.length, theirs.width, theirs.height, theirs.heading),
     )
     assert (box.name, box.kind, box.seen_by) == (label.id, label.type, label.most_visible_camera_name)
-
-
-def test_tri3d_finds_the_same_points_boxes_and_images(tmp_path):
-    """tri3d 0.2 asks for some tables and columns that we do not read, and for stamps that survive its arithmetic."""
-    waymo = pytest.importorskip("tri3d.datasets.waymo", reason="tri3d, numba or llvmlite is not installed")
-    drive = Drive(synced=False, start=1_532_402_928_000_000_000)
-    root = tmp_path / "training"
-    extra: Row = {f"{kind}.{axis}": 0.0 for kind in ("speed", "acceleration") for axis in "xyz"}
-    extra |= {"num_lidar_points_in_box": 1, "num_top_lidar_points_in_box": 1}
-    extra |= {"difficulty_level.detection": 1, "difficulty_level.tracking": 1}
-
-    def change(component: str, rows: list[Row]) -> list[Row]:
-        return [row | extra for row in rows] if component == "lidar_box" else rows
-
-    tables.write_drive(root, drive, change=change)
-    for component in ("camera_box", "lidar_segmentation"):
-        tables.write(root / component / f"{NAME}.parquet", "Component", [{SEGMENT: NAME, FRAME: 0, LASER: 1}])
-    theirs = waymo.Waymo(tmp_path, "training")
-    ours = WaymoReader(root=tmp_path).recording()
-    for frame in range(4):
-        pose = drive.frame_pose(frame)
-        points = [theirs._points(0, frame, "LIDAR_TOP")]
-        world = points[0] @ pose[:3, :3].T + pose[:3, 3]
-        # Theirs are float32 in the vehicle's frame, after poses of 4 km in float32.
-        np.testing.assert_allclose(there(ours.sweeps)[frame].read()[: len(world)], world, atol=5e-3)
-        assert there(ours.frame_stamps)[frame] / 1e9 == pytest.approx(theirs.timelines[0]["LIDAR_TOP"][frame], abs=1e-6)
-        shots = [shot for shot in ours.shots if (shot.frame, shot.camera) == (frame, 0)]
-        assert np.array_equal(theirs.image(0, frame, "IMG_FRONT"), ours.read_image(shots[0]))
-    (car,), boxes = there(ours.boxes), theirs._boxes(0)
-    for frame, box in enumerate(boxes):
-        center = drive.frame_pose(frame) @ np.append(box.center, 1)
-        np.testing.assert_allclose(car.poses[frame][:3, 3], center[:3], atol=1e-9)
-        np.testing.assert_allclose(car.sizes[frame], box.size)

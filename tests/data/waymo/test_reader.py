@@ -33,9 +33,6 @@ def test_poses_and_stamps(root, drive):
         # float32 velocities of a pose at the same instant change nothing.
         np.testing.assert_allclose(shot.world_from_camera.numpy(), expected, rtol=0, atol=PLACE)
         assert shot.exposure == pytest.approx(EXPOSURE / 1e9)
-
-
-def test_the_vehicle_is_where_it_was(root, drive):
     vehicle = there(WaymoReader(root=root, first_frame=1).recording().vehicle)
     assert vehicle.stamps.tolist() == drive.stamps[1:].tolist()
     expected = np.stack([drive.frame_pose(frame) for frame in (1, 2, 3)])

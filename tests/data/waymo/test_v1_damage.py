@@ -12,8 +12,7 @@ import pytest
 
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.waymo import WaymoReader
-from sparsestreet.data.waymo.v1.records import Records, masked_crc32c
-from sparsestreet.data.waymo.v1.segment import RecordSegment
+from sparsestreet.data.waymo.v1 import Records, RecordSegment, masked_crc32c
 from tests.conftest import unchecked
 from tests.data.damage import daily
 from tests.data.waymo import records
@@ -53,21 +52,17 @@ FIELDS = {
     "another segment": (field([1, 1], data(1, "other")), "frame 1: it is of the segment 'other'"),
     "pose of 15 numbers": (field([3], data(3, doubles(1, [0.0] * 15))), "frame 1, pose has 15 numbers, not 16"),
     "pose of bytes": (field([3], data(3, data(1, b"abc"))), "frame 1, pose: field 1 holds no doubles"),
-    "pose with NaN": (field([3], data(3, doubles(1, [NAN] * 16))), "NaN or infinity"),
-    "scaled pose": (field([3], data(3, doubles(1, 2 * POSE.ravel()))), "no rigid transform"),
     "eight intrinsics": (calibration([(2, 0), 2], doubles(2, [1.0] * 8)), "camera FRONT has the intrinsics"),
-    "no focal length": (calibration([(2, 0), 2], doubles(2, [0.0] * 9)), "focal lengths above 0"),
     "lens": (calibration([(2, 0), 2], doubles(2, [30, 30, 16, 12, 0, 0, 1, 1, 0])), "no inverse"),
-    "no width": (calibration([(2, 0), 4], b""), "images of 0x24 pixels"),
     "absurd width": (calibration([(2, 0), 4], integer(4, 2**40)), f"images of {2**40}x24 pixels"),
     "direction": (calibration([(2, 0), 6], integer(6, 9)), "rolling_shutter_direction 9"),
     "a ninth camera": (calibration([(2, 0), 1], integer(1, 9)), "it is of number 9, not one of"),
     "mount": (calibration([(2, 0), 3], b""), "extrinsic has 0 numbers, not 16"),
     "beams in disorder": (calibration([(3, 0), 2], doubles(2, [0.1, 0, 0.2, 0.3, 0.4, 0.5])), "no ascending angles"),
     "beams beyond": (calibration([(3, 0), 2], doubles(2, [0.1, 0.2, 0.3, 0.4, 0.5, 9])), "up to a quarter turn"),
+    "limits in disorder": (calibration([(3, 1), 3], double(3, 1.0)), "no ascending angles"),
     "a beam too few": (calibration([(3, 0), 2], doubles(2, [0.1, 0.2, 0.3, 0.4, 0.5])), "5 inclinations"),
     "uncalibrated lidar": (calibration([(3, 1), 1], integer(1, 5)), "lidar FRONT has range images, but no calibration"),
-    "image pose": (field([(4, 1), 3], b""), "frame 1, images 1: pose has 0 numbers"),
     "velocity": (field([(4, 1), 4, 1], double(1, NAN)), "frame 1, images 1 has velocities or times that are NaN"),
     "no trigger": (field([(4, 1), 7], b""), "frame 1, images 1: field 7 is missing"),
     "read out before": (field([(4, 1), 8], double(8, 1e9)), "no camera takes an image so"),
@@ -101,10 +96,6 @@ FIELDS = {
         "NaN, infinite or more than",
     ),
     "poses of other pixels": (field([(5, 0), 2, 4], data(4, floats(np.ones((6, 9, 6))))), "poses of (6, 9)"),
-    "torn label": (
-        field([(4, 1), 10, 2], data(2, b"\x89PNG\r\n\x1a\nxx")),
-        "panoptic label of FRONT at frame 1 cannot",
-    ),
     "divisor": (field([(4, 1), 10, 1], integer(1, 0)), "has the divisor 0"),
     "wire type": (field([3], b"\x1b"), "frame 1: the field at byte"),
     "field 0": (field([3], data(0, "x")), "frame 1: field 0 says"),
@@ -118,7 +109,7 @@ FIELDS = {
 
 
 @pytest.mark.parametrize(
-    "name", daily(FIELDS, "pose of bytes", "pose with NaN", "image of another size", "bomb", "torn range image")
+    "name", daily(FIELDS, "pose of bytes", "box with NaN", "image of another size", "bomb", "torn range image")
 )
 def test_a_damaged_field(name, messages, tmp_path):
     change, said = FIELDS[name]
@@ -197,14 +188,6 @@ def test_mutated_messages_are_read_or_refused(messages, tmp_path):
             refused += 1
         path.unlink()
     assert 40 < refused < 200
-
-
-def test_checksums_are_those_of_the_definition(messages):
-    """Of all small lengths, and of whole blocks and one byte more; CRC-32C of "123456789" is 0xe3069283."""
-    assert records.masked(b"123456789") == ((0xE3069283 >> 15 | 0xE3069283 << 17) + 0xA282EAD8) & 0xFFFFFFFF
-    payload = messages[0]
-    for length in (0, 1, 2, 7, 8, 9, 100, 2047, 2048, 2049, 4096, 6145, len(payload)):
-        assert masked_crc32c(payload[:length]) == records.masked(payload[:length])
 
 
 def test_a_record_is_not_read_to_find_the_next(tmp_path):
