@@ -303,10 +303,6 @@ class SparseModel:
     points: Path | None
     """None: the model has none."""
 
-    @property
-    def files(self) -> list[Path]:
-        return [self.cameras, self.images, *([self.points] if self.points else [])]
-
 
 def find_model(root: Path, folder: str | None) -> SparseModel:
     """The model in a folder below ``root``, in binary where it is in both; None: in a usual one. Raises LogError."""
