@@ -3,14 +3,14 @@
 import os
 import threading
 import weakref
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -128,7 +128,7 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_open_all)
 
 
-_MASKS = tuple(entry.name for entry in fields(Frame) if entry.name in ("sky", "human", "vehicle", "ego"))
+_MASKS = ("sky", "human", "vehicle", "ego")
 
 
 @dataclass(frozen=True)
@@ -188,9 +188,6 @@ class Returns:
         depth = torch.zeros(size, dtype=self.values.dtype)
         depth.view(-1)[self.places] = self.values
         return depth
-
-
-K = TypeVar("K", bound=Hashable)
 
 
 CacheSize = int | Literal["auto"]
@@ -280,42 +277,6 @@ class FrameCache:
         return FALLBACK_BYTES - self._used if free is None else (free - self._used) // 2
 
 
-class LruCache(Generic[K, T]):
-    """What ``load`` makes of a key, remembered while there is room; what was not used for longest makes way.
-
-    Threads may ask at the same time; each then loads what none remembers yet.
-    """
-
-    def __init__(self, load: Callable[[K], T], size: Callable[[T], int], room: int) -> None:
-        """``room`` is in the unit of ``size``; a value that is larger on its own is not remembered."""
-        self._load = load
-        self._size = size
-        self._room = room
-        self._held: OrderedDict[K, T] = OrderedDict()
-        self._used = 0
-        self._lock = Lock()
-
-    def __call__(self, key: K) -> T:
-        with self._lock:
-            if key in self._held:
-                self._held.move_to_end(key)
-                return self._held[key]
-        value = self._load(key)
-        size = self._size(value)
-        if size <= self._room:
-            with self._lock:
-                self._hold(key, value, size)
-        return value
-
-    def _hold(self, key: K, value: T, size: int) -> None:
-        if key in self._held:  # another thread was faster
-            return
-        self._held[key] = value
-        self._used += size
-        while self._used > self._room:
-            self._used -= self._size(self._held.popitem(last=False)[1])
-
-
 MAX_THREADS = 8
 THREAD_NAME = "frames"
 """What the threads' names begin with."""
@@ -336,22 +297,6 @@ class ArrivingFrame:
             # Its memory belongs to the stream that copied it, and is not to be reused before this one is done.
             tensor.record_stream(stream)
         return self.frame
-
-
-class CopyStream:
-    """Copies frames to a GPU on a stream of its own, so that they travel while a step computes."""
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self._stream = torch.cuda.Stream(device)
-
-    def send(self, frame: Frame) -> ArrivingFrame:
-        """Any thread may call it, and waits for the pinned copy on the host alone."""
-        done = torch.cuda.Event()
-        with torch.cuda.stream(self._stream):
-            moved = to_device(frame, self._device)
-            done.record(self._stream)
-        return ArrivingFrame(moved, done)
 
 
 def _tensors(frame: Frame) -> Iterator[torch.Tensor]:
@@ -381,7 +326,9 @@ class Prefetcher:
             raise ValueError(f"threads must be at least 1, got {threads}")
         self._read = read
         self._threads = threads or min(torch.get_num_threads(), MAX_THREADS)
-        self._stream = CopyStream(device) if device.type == "cuda" else None
+        self._device = device
+        self._stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        """Frames travel on it while a step computes."""
         self._executors: list[ThreadPoolExecutor] = []
         """One thread, then all others."""
         self._pending: deque[Future[Frame | ArrivingFrame]] = deque()
@@ -414,7 +361,13 @@ class Prefetcher:
 
     def _fetch(self, draw: int) -> Frame | ArrivingFrame:
         frame = self._read(draw)
-        return frame if self._stream is None else self._stream.send(frame)
+        if self._stream is None:
+            return frame
+        done = torch.cuda.Event()
+        with torch.cuda.stream(self._stream):
+            moved = to_device(frame, self._device)
+            done.record(self._stream)
+        return ArrivingFrame(moved, done)
 
     def _start(self) -> None:
         if self._process != os.getpid():

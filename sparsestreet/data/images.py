@@ -394,7 +394,7 @@ def number_lines(numbers: Float[np.ndarray, "..."] | Sequence[float]) -> bytes:
     return file.getvalue()
 
 
-_KINDS = ("sky", "human", "vehicle", "ego")
+MASK_KINDS = ("sky", "human", "vehicle", "ego")
 
 
 @dataclass(frozen=True)
@@ -404,15 +404,17 @@ class GivenMasks:
     A camera without a folder has no masks of the kind; one with a folder has them for all of its images.
     """
 
-    root: Path
+    root: Path | None
+    """None: nobody made any."""
 
     @property
     def kinds(self) -> frozenset[str]:
-        return frozenset(kind for kind in _KINDS if (self.root / kind).is_dir())
+        root = self.root
+        return frozenset(() if root is None else (kind for kind in MASK_KINDS if (root / kind).is_dir()))
 
     def paths(self, camera: str, stem: str) -> dict[str, Path]:
         """Kind -> the file of an image, for the kinds that its camera has."""
-        folders = {kind: self.root / kind / camera for kind in _KINDS}
+        folders = {} if self.root is None else {kind: self.root / kind / camera for kind in MASK_KINDS}
         return {kind: folder / f"{stem}.png" for kind, folder in folders.items() if folder.is_dir()}
 
     def read(
@@ -440,14 +442,7 @@ class GivenMasks:
 
     def check(self, images: Iterable[tuple[str, str]]) -> list[Problem]:
         """What is missing for some images, each a camera and a stem."""
-        if not self.kinds:
-            message = f"it holds none of the folders {', '.join(_KINDS)}"
+        if self.root is not None and not self.kinds:
+            message = f"it holds none of the folders {', '.join(MASK_KINDS)}"
             return [Problem(self.root, message, "name the folder that holds them (data.log.masks), or null")]
         return missing_files(path for camera, stem in images for path in self.paths(camera, stem).values())
-
-    def check_pixels(self, images: Iterable[tuple[str, str]], size: tuple[int, int]) -> list[Problem]:
-        """What is wrong with those that are there, all of which are decoded; ``size``: (width, height) as recorded."""
-        problems: list[Problem] = []
-        for path in filter(Path.is_file, (path for each in images for path in self.paths(*each).values())):
-            attempt(problems, partial(check_mask, path, size, decode=True))
-        return problems

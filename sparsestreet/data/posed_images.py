@@ -7,24 +7,32 @@ with numbers in them counted, or of times where the data set gives them.
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
 
 import torch
-from jaxtyping import Bool, Float, Float64, UInt8
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_image, read_mask
+from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_mask
 from sparsestreet.data.poses import check_extent, check_rigid
-from sparsestreet.data.problems import Problem, attempt, fault, missing_files, missing_notes
-from sparsestreet.data.reader import chosen_cameras, frame_window
-from sparsestreet.data.recording import RecordedImage, RecordedReader, Recording
+from sparsestreet.data.problems import (
+    LogError,
+    Missing,
+    Problem,
+    attempt,
+    check_missing,
+    fault,
+    missing_files,
+    missing_notes,
+)
+from sparsestreet.data.reader import LogFiles, chosen_cameras, frame_window
+from sparsestreet.data.recording import RecordedImage, RecordedReader, Recording, read_given, read_shot
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.geometry.lenses import Lens
-
-SparsePointsReader = Callable[[], tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]]
 
 
 @dataclass(frozen=True)
@@ -100,81 +108,119 @@ def there(images: Sequence[PosedImage], table: Path) -> tuple[list[PosedImage], 
     return found, missing_notes(len(images) - len(found), len(images))
 
 
-def check_images(images: PosedImages, table: Path, *, masks: Path | str | None, decode: bool) -> list[Problem]:
-    """What is wrong with lenses, poses and files of images and masks; all pixels are looked at if ``decode``.
+@dataclass(frozen=True)
+class PosedTable:
+    """What a data set says of its images."""
 
-    Args:
-        images: those that are read.
-        table: the file that lists them.
-        masks: folder of the user's own, if there is one.
-        decode: whether pixels are decoded.
-    """
-    problems = missing_files(path for image in images.images for path in (image.path, image.valid) if path)
-    placed = []
-    for name, (lens, size) in images.cameras.items():
-        own = [instant[name] for instant in images.instants if name in instant]
-        attempt(problems, partial(check_lens_camera, table, lens, size))
-        valid = [image.valid for image in own if image.valid]
-        problems += check_camera_images(name, [image.path for image in own], valid, decode=decode)
-        problems += check_image_sizes(name, size, [image.path for image in own])
-        for image in own:
-            attempt(problems, partial(check_rigid, image.world_from_camera, table, f"the pose of {image.name}"))
-            placed.append((table, image.world_from_camera[:3, 3]))
-    if masks is not None:
-        given = GivenMasks(Path(masks))
-        problems += given.check(
+    path: Path
+    """The file that lists them."""
+    images: Sequence[PosedImage]
+    points: Path | None
+    """The file of its sparse points."""
+    notes: Sequence[str]
+    others: Sequence[Path] = ()
+    """More files of numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PosedReader(RecordedReader):
+    """A data set of posed images, in a unit of its own. There are no returns and no boxes."""
+
+    scale: float = 1.0
+    """Meters to a unit of the data set."""
+    pinhole_fov: float | None = None
+    """Degrees that the pinhole of a fisheye sees from left to right; None: its resolution is that of the center."""
+    missing: Missing = "error"
+    """skip: images that are listed and have no file are left out with a note, before frames are counted."""
+
+    def __post_init__(self) -> None:
+        check_missing(self.missing)
+
+    @abstractmethod
+    def table(self) -> PosedTable:
+        """All images of the data set. Raises LogError with every one at fault."""
+
+    @abstractmethod
+    def read_points(self, path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Positions in the unit of the data set, and RGB in [0, 1]."""
+
+    def recording(self) -> Recording:
+        if not 0 < self.scale < math.inf:
+            raise ValueError(
+                f"scale must be positive meters to a unit, got {self.scale:g}: 1 leaves lengths as they are"
+            )
+        table, images = self._sorted()
+        if problems := _missing_points(table) + self._problems(images, table.path):
+            raise LogError(problems)
+        rig = [
+            lens_camera(name, index, lens=lens, recorded_size=size, width=self.width, pinhole_fov=self.pinhole_fov)
+            for index, (name, (lens, size)) in enumerate(images.cameras.items())
+        ]
+        shots = [
+            RecordedImage(frame, camera.index, _scaled(image.world_from_camera, self.scale), image, image.path.stem)
+            for frame, instant in enumerate(images.instants)
+            for camera in rig
+            if (image := instant.get(camera.name)) is not None
+        ]
+        has_own = any(image.valid for image in images.images)
+        return Recording(
+            name=self.folder.resolve().name,
+            rig=rig,
+            shots=shots,
+            read_image=partial(read_shot, rig),
+            read_masks=partial(_masks, rig, self.given),
+            mask_kinds=self.given.kinds.union({"ego"} if has_own else ()),
+            sparse_points=None if table.points is None else partial(self._scaled_points, table.points),
+            points_file=table.points,
+            notes=(_note_of_scale(shots, self.scale), *table.notes),
+        )
+
+    def files(self) -> LogFiles:
+        table, images = self._sorted()
+        pixels = [path for image in images.images for path in (image.path, image.valid) if path]
+        return LogFiles(
+            [table.path, *table.others], [*dict.fromkeys(pixels), *([table.points] if table.points else [])]
+        )
+
+    def _sorted(self) -> tuple[PosedTable, PosedImages]:
+        table = self.table()
+        images = sort_images(
+            table.images,
+            table.path,
+            cameras=self.cameras,
+            first_frame=self.first_frame,
+            last_frame=self.last_frame,
+        )
+        return table, images
+
+    def _problems(self, images: PosedImages, table: Path) -> list[Problem]:
+        """What is wrong with lenses, poses and files of images and masks; no pixel is decoded."""
+        problems = missing_files(path for image in images.images for path in (image.path, image.valid) if path)
+        placed = []
+        for name, (lens, size) in images.cameras.items():
+            own = [instant[name] for instant in images.instants if name in instant]
+            attempt(problems, partial(check_lens_camera, table, lens, size))
+            valid = [image.valid for image in own if image.valid]
+            problems += check_camera_images(name, [image.path for image in own], valid, decode=False)
+            problems += check_image_sizes(name, size, [image.path for image in own])
+            for image in own:
+                attempt(problems, partial(check_rigid, image.world_from_camera, table, f"the pose of {image.name}"))
+                placed.append((table, image.world_from_camera[:3, 3]))
+        problems += self.given.check(
             (name, image.path.stem) for instant in images.instants for name, image in instant.items()
         )
-        for name, (_, size) in images.cameras.items() if decode else ():
-            stems = [(name, instant[name].path.stem) for instant in images.instants if name in instant]
-            problems += given.check_pixels(stems, size)
-    return problems or check_extent(placed)
+        return problems or check_extent(placed)
+
+    def _scaled_points(self, path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        positions, colors = self.read_points(path)
+        return self.scale * positions, colors
 
 
-def recording_of(
-    reader: RecordedReader,
-    images: PosedImages,
-    *,
-    scale: float,
-    pinhole_fov: float | None,
-    sparse_points: SparsePointsReader | None,
-    points_file: Path | None,
-    notes: Sequence[str],
-) -> Recording:
-    """The recording of sound images, ``scale`` meters to a unit. Raises ValueError for a scale that is not positive."""
-    if not 0 < scale < math.inf:
-        raise ValueError(f"scale must be positive meters to a unit, got {scale:g}: 1 leaves lengths as they are")
-    rig = [
-        lens_camera(
-            name,
-            index,
-            lens=lens,
-            recorded_size=size,
-            width=reader.width,
-            pinhole_fov=pinhole_fov,
-        )
-        for index, (name, (lens, size)) in enumerate(images.cameras.items())
-    ]
-    shots = [
-        RecordedImage(frame, camera.index, _scaled(image.world_from_camera, scale), image, image.path.stem)
-        for frame, instant in enumerate(images.instants)
-        for camera in rig
-        if (image := instant.get(camera.name)) is not None
-    ]
-    given = None if reader.masks is None else GivenMasks(Path(reader.masks))
-    kinds = given.kinds if given else frozenset[str]()
-    has_own = any(image.valid for image in images.images)
-    return Recording(
-        name=reader.folder.resolve().name,
-        rig=rig,
-        shots=shots,
-        read_image=partial(_image, rig),
-        read_masks=partial(_masks, rig, given),
-        mask_kinds=kinds | {"ego"} if has_own else kinds,
-        sparse_points=None if sparse_points is None else partial(_scaled_points, sparse_points, scale),
-        points_file=points_file,
-        notes=(_note_of_scale(shots, scale), *notes),
-    )
+def _missing_points(table: PosedTable) -> list[Problem]:
+    if table.points is None or table.points.is_file():
+        return []
+    message = f"the file is missing, which {table.path.name} names as the one of its points"
+    return [Problem(table.points, message, "write it, or remove its name")]
 
 
 def natural(key: object) -> list[tuple[int, float | int, str]]:
@@ -210,42 +256,21 @@ def _camera_names(images: Sequence[PosedImage]) -> dict[tuple[str, Lens, tuple[i
     return named
 
 
-def _image(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-    camera = rig[shot.camera]
-    return read_image(_posed(shot).path, camera.size, camera.undistortion)
-
-
-def _masks(
-    rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: RecordedImage
-) -> dict[str, Bool[Tensor, "h w"]]:
+def _masks(rig: Sequence[RigCamera[str]], given: GivenMasks, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
     """Those that the data set and the user have; what either excludes is excluded."""
-    camera, image = rig[shot.camera], _posed(shot)
-    masks: dict[str, Bool[Tensor, "h w"]] = {}
-    if given is not None:
-        masks = given.read(
-            camera.name, shot.stem, recorded_size=image.size, size=camera.size, undistortion=camera.undistortion
-        )
-    if image.valid is not None:
-        # The nearest pixel: between black and white nothing is valid in part.
-        excluded = ~read_mask(image.valid, camera.size, sky=True, undistortion=camera.undistortion)
-        masks["ego"] = masks["ego"] | excluded if "ego" in masks else excluded
-    return masks
-
-
-def _posed(shot: RecordedImage) -> PosedImage:
     assert isinstance(shot.key, PosedImage)
-    return shot.key
+    camera, masks = rig[shot.camera], read_given(rig, given, shot)
+    if shot.key.valid is None:
+        return masks
+    # The nearest pixel: between black and white nothing is valid in part.
+    excluded = ~read_mask(shot.key.valid, camera.size, sky=True, undistortion=camera.undistortion)
+    return masks | {"ego": masks["ego"] | excluded if "ego" in masks else excluded}
 
 
 def _scaled(pose: Float64[Tensor, "4 4"], scale: float) -> Float64[Tensor, "4 4"]:
     scaled = pose.clone()
     scaled[:3, 3] *= scale
     return scaled
-
-
-def _scaled_points(read: SparsePointsReader, scale: float) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
-    positions, colors = read()
-    return scale * positions, colors
 
 
 def _note_of_scale(shots: Sequence[RecordedImage], scale: float) -> str:

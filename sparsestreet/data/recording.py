@@ -8,7 +8,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache, lru_cache, partial
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import TypeVar
@@ -19,7 +19,9 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.frame_cache import CacheSize, FrameCache, LruCache, MemoryForecast, cache_bytes
+from sparsestreet.data.hood import bottom_rows
 from sparsestreet.data.images import (
+    MASK_KINDS,
     GivenMasks,
     check_camera_images,
     image_notes,
@@ -91,7 +93,7 @@ class SceneFolder:
         self._frames = FrameCache(self._read_frame, self._cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.
         read = self._read_points
-        self._points = None if read is None else LruCache(self._carried(read), lambda points: 1, 1)
+        self._points = None if read is None else lru_cache(maxsize=1)(self._carried(read))
 
     def holding_out(self, frames: frozenset[int]) -> tuple[Frames, Sweeps]:
         """Frames and sweeps, of which those of other instants depend on no box of these frames."""
@@ -167,9 +169,6 @@ class SceneFolder:
         return self._clock.moment(index, self._sweep_stamps.get(index))
 
 
-MASK_KINDS = ("sky", "human", "vehicle", "ego")
-
-
 @dataclass(frozen=True)
 class RecordedImage:
     """One recorded image."""
@@ -196,6 +195,12 @@ class RecordedImage:
         """The file of its pixels; None: they stand in the file of many."""
         found = getattr(self.key, "path", self.key)
         return Path(found) if isinstance(found, (str, Path)) else None
+
+    @property
+    def file(self) -> Path:
+        """The same, of an image that is known to have a file of its own."""
+        assert self.path is not None
+        return self.path
 
 
 @dataclass(frozen=True)
@@ -340,23 +345,30 @@ class RecordedReader(LogReader):
     def folder(self) -> Path:
         return Path(self.root)
 
+    @property
+    def given(self) -> GivenMasks:
+        """Masks that somebody made."""
+        return GivenMasks(None if self.masks is None else Path(self.masks))
+
     @abstractmethod
     def recording(self) -> Recording:
         """What is in the files, nothing large decoded. Raises LogError with every problem found, ValueError where the
         wanted part is not there."""
 
     def check_contents(self) -> list[Problem]:
-        """What is wrong with pixels and points, all of which are decoded; here of images whose keys are their paths."""
+        """What is wrong with pixels and points, all of which are decoded; here of images that are files."""
         recording = self.recording()
         problems: list[Problem] = []
         for camera in recording.rig:
-            paths = [Path(str(shot.key)) for shot in recording.shots if shot.camera == camera.index]
+            paths = [shot.path for shot in recording.shots if shot.camera == camera.index and shot.path is not None]
             problems += check_camera_images(camera.name, paths, (), decode=True)
         for shot in recording.shots if recording.mask_kinds else ():
             attempt(problems, partial(recording.read_masks, shot))
         for sweep in (recording.sweeps or {}).values():
             attempt(problems, sweep.read)
-        return problems
+        if recording.sparse_points is not None:
+            attempt(problems, recording.sparse_points)
+        return list(dict.fromkeys(problems))  # many images may have one mask
 
     @property
     def given(self) -> GivenMasks | None:
@@ -389,6 +401,33 @@ class RecordedReader(LogReader):
         for camera in recording.rig:
             own = [shot for shot in recording.shots if shot.camera == camera.index]
             yield from image_notes(camera.name, [path for shot in own if (path := shot.path) is not None])
+
+
+def read_shot(rig: Sequence[RigCamera], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
+    """Return the pixels of an image that is a file of its own, as its camera has them."""
+    camera = rig[shot.camera]
+    return read_image(shot.file, camera.size, camera.undistortion)
+
+
+def read_given(rig: Sequence[RigCamera], given: GivenMasks, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
+    """Return what somebody made of an image that is a file of its own, as its camera has the pixels."""
+    camera, stem = rig[shot.camera], shot.stem
+    if given.root is None:
+        return {}
+    recorded = image_size(shot.file)
+    return given.read(camera.name, stem, recorded_size=recorded, size=camera.size, undistortion=camera.undistortion)
+
+
+def given_or_rows(
+    rig: Sequence[RigCamera], given: GivenMasks, rows: Mapping[str, tuple[int, int]], shot: RecordedImage
+) -> dict[str, Bool[Tensor, "h w"]]:
+    """Return what somebody made; of the recording car, where that is absent, the lowest rows.
+
+    ``rows``: camera -> how many show the car, and of how many.
+    """
+    camera = rig[shot.camera]
+    own = {"ego": bottom_rows(camera.size, *rows[camera.name])} if camera.name in rows else {}
+    return own | read_given(rig, given, shot)
 
 
 def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[], list[Problem]]) -> DrivingLog:

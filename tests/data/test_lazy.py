@@ -1,11 +1,8 @@
-"""Nothing is read before it is asked for, and what was read stays while there is room."""
+"""Nothing is read before it is asked for."""
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from sparsestreet.data.frame_cache import LruCache
 from sparsestreet.data.lazy import Frames, LazySequence, Sweeps, as_frames
 from sparsestreet.types import Frame, Sweep, View
 from tests.data.plan import make_log
@@ -71,65 +68,6 @@ def test_stamps_of_sweeps_are_known_without_reading_any():
     assert Sweeps([3, 5], load, stamps={3: 300, 5: 500}).where(lambda index: index > 3).stamps[5] == 500
     sweep = Sweep(2, 0.0, torch.zeros(1, 3), torch.zeros(1, 3), torch.zeros(1, dtype=torch.bool), 0.0, 200)
     assert Sweeps.of((sweep,)).stamps == {2: 200}
-
-
-def test_what_was_not_used_for_longest_makes_way():
-    asked: list[int] = []
-
-    def load(key: int) -> int:
-        asked.append(key)
-        return key
-
-    cache = LruCache(load, size=lambda value: value, room=10)
-    assert [cache(key) for key in (3, 4, 2, 3)] == [3, 4, 2, 3]  # 9 of 10 are used
-    assert asked == [3, 4, 2]
-    cache(5)  # 14: 4 must go, for 3 was used after it, and 2 is enough to stay
-    cache(3)
-    cache(2)
-    assert asked == [3, 4, 2, 5]
-    cache(4)  # now 5 was not used for longest
-    cache(3)
-    cache(2)
-    assert asked == [3, 4, 2, 5, 4]
-    cache(5)
-    assert asked == [3, 4, 2, 5, 4, 5]
-
-
-def test_what_is_larger_than_the_room_is_not_kept_and_drives_nothing_out():
-    asked: list[int] = []
-
-    def load(key: int) -> int:
-        asked.append(key)
-        return key
-
-    cache = LruCache(load, size=lambda value: value, room=10)
-    for key in (10, 11, 10, 11):
-        assert cache(key) == key
-    assert asked == [10, 11, 11]
-
-
-@settings(deadline=None)  # the first example pays for what is built once
-@given(st.lists(st.integers(0, 12), max_size=60), st.integers(0, 30))
-def test_a_cache_never_holds_more_than_it_may_and_forgets_only_where_it_must(keys, room):
-    """Against a list in order of use, the straightforward way."""
-    asked: list[int] = []
-
-    def load(key: int) -> int:
-        asked.append(key)
-        return key
-
-    cache = LruCache(load, size=lambda value: value, room=room)
-    held, expected = [], []
-    for key in keys:
-        cache(key)
-        if key not in held:
-            expected.append(key)
-        if key > room:
-            continue
-        held = [other for other in held if other != key] + [key]
-        while sum(held) > room:
-            held.pop(0)
-    assert asked == expected
 
 
 def test_an_error_of_reading_does_not_end_an_iteration():

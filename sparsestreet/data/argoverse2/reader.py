@@ -10,16 +10,23 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.hood import bottom_rows
-from sparsestreet.data.images import GivenMasks, image_size, read_image
+from sparsestreet.data.images import image_size
 from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.poses import PosePath, check_extent, rigid_poses
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import (
+    Boxes,
+    LidarSweep,
+    RecordedImage,
+    RecordedReader,
+    Recording,
+    given_or_rows,
+    read_shot,
+)
 from sparsestreet.data.rig import RigCamera
 
 MAX_BYTES = 64_000_000
@@ -399,21 +406,16 @@ class Argoverse2Reader(RecordedReader):
         boxes, homeless = _boxes(chosen, path)
         placed = [(chosen.layout.poses, shot.world_from_camera[:3, 3]) for shot in shots]
         placed += [(one.path, position) for one in boxes or () for position in torch.from_numpy(one.poses[:, :3, 3])]
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
-        problems = check_extent(placed)
-        if given is not None:
-            problems += given.check((rig[shot.camera].name, shot.stem) for shot in shots)
+        problems = check_extent(placed) + self.given.check((rig[shot.camera].name, shot.stem) for shot in shots)
         if problems:
             raise LogError(problems)
         return Recording(
             name=chosen.layout.root.resolve().name,
             rig=rig,
             shots=shots,
-            read_image=partial(_read_image, rig),
-            read_masks=partial(_read_masks, rig, mounts, given),
-            mask_kinds=frozenset({"ego"} if EGO_ROWS.keys() & chosen.images.keys() else ()).union(
-                given.kinds if given else ()
-            ),
+            read_image=partial(read_shot, rig),
+            read_masks=partial(given_or_rows, rig, self.given, EGO_ROWS),
+            mask_kinds=self.given.kinds.union({"ego"} if EGO_ROWS.keys() & chosen.images.keys() else ()),
             frame_stamps=chosen.instants,
             sweeps=_sweeps(chosen, path) if self.lidar else None,
             boxes=boxes,
@@ -500,21 +502,6 @@ def _boxes(chosen: Selection, path: PosePath) -> tuple[list[Boxes] | None, int]:
         return None, 0
     frames = {stamp: frame for frame, stamp in enumerate(chosen.instants)}
     return read_boxes(chosen.layout, list(chosen.sweeps), frames, path)
-
-
-def _read_image(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-    return read_image(Path(str(shot.key)), rig[shot.camera].size)
-
-
-def _read_masks(
-    rig: Sequence[RigCamera[str]], mounts: Mapping[str, MountedCamera], given: GivenMasks | None, shot: RecordedImage
-) -> dict[str, Bool[Tensor, "h w"]]:
-    """Rows of the own car, and what somebody made, which counts where both are."""
-    camera = rig[shot.camera]
-    own = {"ego": bottom_rows(camera.size, *EGO_ROWS[camera.name])} if camera.name in EGO_ROWS else {}
-    if given is None:
-        return own
-    return own | given.read(camera.name, shot.stem, recorded_size=mounts[camera.name].size, size=camera.size)
 
 
 def _notes(chosen: Selection, duplicates: int, homeless: int, shots: int) -> tuple[str, ...]:

@@ -2,20 +2,18 @@
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path, PurePosixPath
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.images import image_size
 from sparsestreet.data.json_tree import JsonValue, read_json
 from sparsestreet.data.ply import read_ply
-from sparsestreet.data.posed_images import PosedImage, PosedImages, check_images, recording_of, sort_images
-from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_notes
-from sparsestreet.data.reader import FolderSignature, LogFiles
-from sparsestreet.data.recording import RecordedReader, Recording
+from sparsestreet.data.posed_images import PosedImage, PosedReader, PosedTable
+from sparsestreet.data.problems import LogError, attempt, missing_notes
+from sparsestreet.data.reader import FolderSignature
 from sparsestreet.geometry.lenses import BrownConrady, Fisheye, Lens
 
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -35,22 +33,7 @@ _MAX_IMAGE = 100_000
 """Pixels on a side."""
 
 
-@dataclass(frozen=True)
-class Transforms:
-    """What a file says of its images."""
-
-    images: tuple[PosedImage, ...]
-    points: Path | None
-    """The .ply with the sparse points."""
-    has_times: bool
-    has_depth: bool
-    unread: tuple[str, ...]
-    """Entries that mean something to other programs, and nothing here."""
-    absent: int
-    """Frames that were left out, because their images are missing."""
-
-
-def read_transforms(path: Path, *, skip: bool = False) -> Transforms:
+def read_transforms(path: Path, *, skip: bool = False) -> PosedTable:
     """Raise LogError with every frame at fault. ``skip``: frames without the file of their image are left out."""
     top = read_json(path)
     listed = top["frames"].items()
@@ -71,14 +54,14 @@ def read_transforms(path: Path, *, skip: bool = False) -> Transforms:
             f"has a time in {timed} of {len(found)} frames", "write it for all of them, or for none"
         )
     points = top.get("ply_file_path")
-    return Transforms(
-        tuple(found),
-        None if points is None else points.path(),
-        timed > 0,
-        any("depth_file_path" in frame for frame in frames),
-        tuple(dict.fromkeys(key for value in (top, *frames) for key in value.unread(_READ + _HARMLESS))),
-        len(listed) - len(frames),
-    )
+    notes = missing_notes(len(listed) - len(frames), len(listed))
+    if unread := dict.fromkeys(key for value in (top, *frames) for key in value.unread(_READ + _HARMLESS)):
+        notes.append(f"nothing reads {', '.join(unread)} of transforms.json")
+    if timed:
+        notes.append("times of the frames order them, but their unit is not known: they are no clock")
+    if any("depth_file_path" in frame for frame in frames):
+        notes.append("depth images of the frames are not read")
+    return PosedTable(path, found, None if points is None else points.path(), notes)
 
 
 def _file(frame: JsonValue) -> Path:
@@ -178,79 +161,16 @@ def _focal(top: JsonValue, frame: JsonValue, key: str, angle: str, pixels: int, 
 
 
 @dataclass(frozen=True, kw_only=True)
-class NerfstudioReader(RecordedReader):
+class NerfstudioReader(PosedReader):
     """A folder with ``transforms.json``, as nerfstudio and instant-ngp write it.
 
-    The world is that of the file's poses and points. There are no returns and no boxes.
+    The world is that of the file's poses and points.
     """
 
     marks = FolderSignature(("transforms.json",))
 
-    scale: float = 1.0
-    """Meters to a unit of the file."""
-    pinhole_fov: float | None = None
-    """Degrees that the pinhole of a fisheye sees from left to right; None: its resolution is that of the center."""
-    missing: Missing = "error"
-    """skip: images that are listed and have no file are left out with a note, before frames are counted."""
+    def table(self) -> PosedTable:
+        return read_transforms(self.folder / "transforms.json", skip=self.missing == "skip")
 
-    def __post_init__(self) -> None:
-        check_missing(self.missing)
-
-    def recording(self) -> Recording:
-        transforms, images = self._read()
-        problems = self._missing_points(transforms) + check_images(images, self._table, masks=self.masks, decode=False)
-        if problems:
-            raise LogError(problems)
-        return recording_of(
-            self,
-            images,
-            scale=self.scale,
-            pinhole_fov=self.pinhole_fov,
-            sparse_points=None if transforms.points is None else partial(read_ply, transforms.points),
-            points_file=transforms.points,
-            notes=_notes(transforms),
-        )
-
-    def check_contents(self) -> list[Problem]:
-        transforms, images = self._read()
-        problems = check_images(images, self._table, masks=self.masks, decode=True) + self._missing_points(transforms)
-        if transforms.points is not None and transforms.points.is_file():
-            attempt(problems, partial(read_ply, transforms.points))
-        return problems
-
-    def files(self) -> LogFiles:
-        transforms, images = self._read()
-        pixels = [path for image in images.images for path in (image.path, image.valid) if path]
-        return LogFiles([self._table], [*dict.fromkeys(pixels), *([transforms.points] if transforms.points else [])])
-
-    @property
-    def _table(self) -> Path:
-        return self.folder / "transforms.json"
-
-    def _read(self) -> tuple[Transforms, PosedImages]:
-        transforms = read_transforms(self._table, skip=self.missing == "skip")
-        images = sort_images(
-            transforms.images,
-            self._table,
-            cameras=self.cameras,
-            first_frame=self.first_frame,
-            last_frame=self.last_frame,
-        )
-        return transforms, images
-
-    def _missing_points(self, transforms: Transforms) -> list[Problem]:
-        if transforms.points is None or transforms.points.is_file():
-            return []
-        message = "the file is missing, which transforms.json names as ply_file_path"
-        return [Problem(transforms.points, message, "write it, or remove ply_file_path")]
-
-
-def _notes(transforms: Transforms) -> list[str]:
-    notes = missing_notes(transforms.absent, transforms.absent + len(transforms.images))
-    if transforms.unread:
-        notes.append(f"nothing reads {', '.join(transforms.unread)} of transforms.json")
-    if transforms.has_times:
-        notes.append("times of the frames order them, but their unit is not known: they are no clock")
-    if transforms.has_depth:
-        notes.append("depth images of the frames are not read")
-    return notes
+    def read_points(self, path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        return read_ply(path)

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.hood import bottom_rows
-from sparsestreet.data.images import GivenMasks, image_size, read_image
+from sparsestreet.data.images import image_size
 from sparsestreet.data.pandaset.tables import (
     CAMERA_FROM_LIDAR,
     EGO_ROWS,
@@ -30,7 +29,15 @@ from sparsestreet.data.pandaset.tables import (
 from sparsestreet.data.poses import check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import (
+    Boxes,
+    LidarSweep,
+    RecordedImage,
+    RecordedReader,
+    Recording,
+    given_or_rows,
+    read_shot,
+)
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.geometry.cameras import inverse, transform_points
 
@@ -188,20 +195,17 @@ class PandaSetReader(RecordedReader):
         shots = _shots(chosen, placed)
         sweeps, spin = self._sweeps(chosen, stamps, world_from_lidar)
         objects = self._objects(chosen, stamps, world_from_lidar, spin)
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
         problems = _check_places(chosen, rig, shots, objects)
-        if given is not None:
-            problems += given.check((rig[shot.camera].name, shot.stem) for shot in shots)
+        problems += self.given.check((rig[shot.camera].name, shot.stem) for shot in shots)
         if problems:
             raise LogError(problems)
-        ego = {"ego"} if EGO_ROWS.keys() & set(chosen.cameras) else set()
         return Recording(
             name=chosen.layout.root.resolve().name,
             rig=rig,
             shots=shots,
-            read_image=partial(_read_image, rig),
-            read_masks=partial(_read_masks, rig, given),
-            mask_kinds=frozenset(ego).union(given.kinds if given else ()),
+            read_image=partial(read_shot, rig),
+            read_masks=partial(given_or_rows, rig, self.given, EGO_ROWS),
+            mask_kinds=self.given.kinds.union({"ego"} if EGO_ROWS.keys() & set(chosen.cameras) else ()),
             frame_stamps=tuple(stamps),
             sweeps=sweeps,
             boxes=None if objects is None else objects.boxes,
@@ -322,22 +326,6 @@ def _check_places(
 
 def _points(path: Path, world_from_lidar: Float64[Tensor, "4 4"]) -> Float64[Tensor, "n 3"]:
     return read_returns(path, world_from_lidar).world
-
-
-def _read_image(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-    return read_image(Path(str(shot.key)), rig[shot.camera].size)
-
-
-def _read_masks(
-    rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: RecordedImage
-) -> dict[str, Bool[Tensor, "h w"]]:
-    """Rows of the own car, and what somebody made, which counts where both are."""
-    camera = rig[shot.camera]
-    own = {"ego": bottom_rows(camera.size, *EGO_ROWS[camera.name])} if camera.name in EGO_ROWS else {}
-    if given is None:
-        return own
-    recorded = image_size(Path(str(shot.key)))
-    return own | given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size)
 
 
 def _notes(objects: Objects | None, spin: Spin | None, *, lidar: bool) -> tuple[str, ...]:

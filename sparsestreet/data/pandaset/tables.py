@@ -24,11 +24,6 @@ from sparsestreet.geometry.cameras import inverse, transform_points
 FRONT = "front_camera"
 """Its instants are the middles of the sweeps."""
 USUAL_CAMERAS = (FRONT, "front_left_camera", "front_right_camera")
-CAMERAS = {
-    FRONT: 0.0, "front_left_camera": 45.0, "front_right_camera": -45.0, "left_camera": 90.0, "right_camera": -90.0,
-    "back_camera": 180.0,
-}  # fmt: skip
-"""About how many degrees to the left each looks."""
 EGO_ROWS = {"back_camera": (260, 1080)}
 """How many of the lowest rows show the recording car, and of how many (NeuRAD crops these)."""
 CAMERA_FROM_LIDAR = torch.eye(4, dtype=torch.float64)

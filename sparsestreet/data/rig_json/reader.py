@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_image, read_mask
+from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_mask
 from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.poses import PosePath, check_extent, untwisted
@@ -19,14 +19,21 @@ from sparsestreet.data.problems import (
     LogError,
     Missing,
     Problem,
-    attempt,
     check_missing,
     fault,
     missing_files,
     missing_notes,
 )
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording
+from sparsestreet.data.recording import (
+    Boxes,
+    LidarSweep,
+    RecordedImage,
+    RecordedReader,
+    Recording,
+    read_given,
+    read_shot,
+)
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.rig_json.table import (
     CameraEntry,
@@ -210,7 +217,7 @@ def _shot(
                 raise image.where.fault(f"has no pose: {error}", remedy) from error
     shutter = _shutter(table.cameras[name], drive, image, stamp)
     exposure = table.cameras[name].exposure
-    return RecordedImage(frame, index, pose, image, image.path.stem, stamp, shutter, exposure)
+    return RecordedImage(frame, index, pose, image.path, image.path.stem, stamp, shutter, exposure)
 
 
 def _shutter(camera: CameraEntry, drive: PosePath | None, image: ImageEntry, stamp: int | None) -> Shutter | None:
@@ -242,28 +249,15 @@ def _drive(frames: Sequence[FrameEntry]) -> PosePath | None:
     return PosePath(torch.tensor(stamps), torch.stack([pose for _, pose in known]), max_extrapolation=step)
 
 
-def read_pixels(rig: Sequence[RigCamera[str]], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-    camera = rig[shot.camera]
-    return read_image(entry_of(shot).path, camera.size, camera.undistortion)
-
-
-def read_masks(
-    table: RigTable, rig: Sequence[RigCamera[str]], given: GivenMasks | None, shot: RecordedImage
+def _read_masks(
+    table: RigTable, rig: Sequence[RigCamera[str]], given: GivenMasks, shot: RecordedImage
 ) -> dict[str, Bool[Tensor, "h w"]]:
-    camera = rig[shot.camera]
-    entry, lens = table.cameras[camera.name], camera.undistortion
-    masks: dict[str, Bool[Tensor, "h w"]] = {}
-    if given is not None:
-        masks = given.read(camera.name, shot.stem, recorded_size=entry.size, size=camera.size, undistortion=lens)
-    if entry.ego_mask is not None:
-        ego = read_mask(entry.ego_mask, camera.size, sky=False, undistortion=lens)
-        masks["ego"] = masks["ego"] | ego if "ego" in masks else ego
-    return masks
-
-
-def entry_of(shot: RecordedImage) -> ImageEntry:
-    assert isinstance(shot.key, ImageEntry)
-    return shot.key
+    camera, masks = rig[shot.camera], read_given(rig, given, shot)
+    path = table.cameras[camera.name].ego_mask
+    if path is None:
+        return masks
+    ego = read_mask(path, camera.size, sky=False, undistortion=camera.undistortion)
+    return masks | {"ego": masks["ego"] | ego if "ego" in masks else ego}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -284,32 +278,22 @@ class RigJsonReader(RecordedReader):
     def recording(self) -> Recording:
         part = self._part()
         rig, shots = [self._camera(part, index) for index in range(len(part.cameras))], part.shots()
-        if problems := self._problems(part, shots, decode=False):
+        if problems := self._problems(part, shots):
             raise LogError(problems)
-        given = None if self.masks is None else GivenMasks(Path(self.masks))
-        kinds = given.kinds if given else frozenset[str]()
         ego = any(part.table.cameras[name].ego_mask for name in part.cameras)
         return Recording(
             name=self.folder.resolve().name,
             rig=rig,
             shots=shots,
-            read_image=partial(read_pixels, rig),
-            read_masks=partial(read_masks, part.table, rig, given),
-            mask_kinds=kinds | {"ego"} if ego else kinds,
+            read_image=partial(read_shot, rig),
+            read_masks=partial(_read_masks, part.table, rig, self.given),
+            mask_kinds=self.given.kinds.union({"ego"} if ego else ()),
             frame_stamps=part.stamps,
             sweeps=part.sweeps(shots) if self.lidar else None,
             boxes=part.boxes(),
             vehicle=part.vehicle,
             notes=self._notes(part),
         )
-
-    def check_contents(self) -> list[Problem]:
-        part = self._part()
-        shots = part.shots()
-        problems = self._problems(part, shots, decode=True)
-        for sweep in ((part.sweeps(shots) if self.lidar else None) or {}).values():
-            attempt(problems, sweep.read)
-        return problems
 
     def files(self) -> LogFiles:
         part = self._part()
@@ -348,23 +332,17 @@ class RigJsonReader(RecordedReader):
             pinhole_fov=self.pinhole_fov,
         )
 
-    def _problems(self, part: Part, shots: Sequence[RecordedImage], *, decode: bool) -> list[Problem]:
+    def _problems(self, part: Part, shots: Sequence[RecordedImage]) -> list[Problem]:
         problems = missing_files(_recorded(part))
         for index, name in enumerate(part.cameras):
-            images = [entry_of(shot).path for shot in shots if shot.camera == index]
+            images = [shot.file for shot in shots if shot.camera == index]
             mask, size = part.table.cameras[name].ego_mask, part.table.cameras[name].size
-            problems += check_camera_images(name, images, [mask] if mask else [], decode=decode)
+            problems += check_camera_images(name, images, [mask] if mask else [], decode=False)
             problems += check_image_sizes(name, size, images)
         if self.lidar and part.table.lidar.vehicle_from_lidar is not None:
             unposed = [place for place in part.places if part.table.frames[place].world_from_vehicle is None]
             problems += [_no_pose(part, place) for place in unposed if part.table.frames[place].sweep is not None]
-        if self.masks is not None:
-            stems = [(part.cameras[shot.camera], shot.stem) for shot in shots]
-            given = GivenMasks(Path(self.masks))
-            problems += given.check(stems)
-            for name in part.cameras if decode else ():
-                own = [(camera, stem) for camera, stem in stems if camera == name]
-                problems += given.check_pixels(own, part.table.cameras[name].size)
+        problems += self.given.check((part.cameras[shot.camera], shot.stem) for shot in shots)
         return problems or check_extent([(part.table.path, shot.world_from_camera[:3, 3]) for shot in shots])
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from sparsestreet.data.colmap import ColmapReader
-from sparsestreet.data.colmap.model import find_model, read_images, read_points
+from sparsestreet.data.colmap.reader import find_model, read_images
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.posed_images import sort_images
 from sparsestreet.data.problems import LogError
@@ -345,7 +345,7 @@ def test_mutated_files_are_read_or_refused(sound, tmp_path):
             with unchecked():
                 model = find_model(tmp_path, None)
                 sort_images(read_images(model, tmp_path), model.images, cameras=None, first_frame=0, last_frame=-1)
-                read_points(there(model.points))
+                ColmapReader(root=tmp_path).read_points(there(model.points))
         except LogError:
             refused += 1
     assert 60 < refused < 120

@@ -18,7 +18,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import LogError
 from sparsestreet.data.recording import Recording
 from sparsestreet.data.rig_json import RigJsonReader
-from sparsestreet.data.rig_json.values import LENSES
+from sparsestreet.data.rig_json.table import LENSES
 from tests.data.plan import Plan, moved
 from tests.data.rig_json.write import in_lidar, write_json
 from tests.typed import there
