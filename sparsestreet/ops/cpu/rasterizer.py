@@ -13,11 +13,10 @@ from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.validate import check_values
+from sparsestreet.ops.validate import check_dtype, check_values
 from sparsestreet.phases import phase
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
-DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
 """Most (splat, tile) pairs of one rendering. A pair takes 24 bytes forward and 48 more backward in float32.
 
@@ -40,7 +39,7 @@ def rasterize(
     ``every_tile`` lists each splat in every tile and visits all lines of the tile, as a check of the lists. It is slow,
     and gives the same layers and infinite radii.
     """
-    _check_dtype(gaussians)
+    check_dtype(gaussians, "backend 'cpu'")
     g = gaussians
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     view = _view(camera, settings, every_tile)
@@ -74,7 +73,7 @@ def _measure(
     function: str, gaussians: Gaussians, camera: Camera, settings: SplatSettings, *structs: Array[c_void_p]
 ) -> None:
     """Call a function of the library that writes what it measures of each row to where ``structs`` point."""
-    _check_dtype(gaussians)
+    check_dtype(gaussians, "backend 'cpu'")
     g = gaussians
     fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
     displacements = _moved(g)
@@ -134,14 +133,6 @@ class _Blend(torch.autograd.Function):
             )
         _raise_for(status, fields, displacements, native.CReport())
         return *gradients, screen, of_gates, None, None, None
-
-
-def _check_dtype(gaussians: Gaussians) -> None:
-    if gaussians.means.dtype not in DTYPES:
-        raise ValueError(
-            f"backend 'cpu' computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians with "
-            "dataclasses.replace and .float(), or use backend='reference'"
-        )
 
 
 def _moved(gaussians: Gaussians) -> Tensor | None:
