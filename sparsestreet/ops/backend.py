@@ -96,8 +96,9 @@ def fused_backend(backend: str, *tensors: Tensor, choices: tuple[str, ...] = CHO
     if backend == "auto":
         if "cpu" in choices and for_library and find_library() is not None:
             return "cpu"
-        on_gpu = {device for _, device in kinds} == {"cuda"}
-        return "triton" if "triton" in choices and on_gpu and for_triton and has_triton() else "torch"
+        if "triton" in choices and _on_gpu(tensors) and for_triton and has_triton():
+            return "triton"
+        return "torch"
     if backend == "cpu":
         if not for_library:
             raise ValueError(
@@ -115,6 +116,10 @@ def fused_backend(backend: str, *tensors: Tensor, choices: tuple[str, ...] = CHO
         if device.type != "cuda" and not _interpreting():
             raise ValueError(f"backend 'triton' needs tensors on a CUDA device, got {device}: use backend='torch'")
     return backend
+
+
+def _on_gpu(tensors: tuple[Tensor, ...]) -> bool:
+    return {tensor.device.type for tensor in tensors} == {"cuda"}
 
 
 def _interpreting() -> bool:
