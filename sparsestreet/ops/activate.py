@@ -17,10 +17,9 @@ def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "a
     """Activates all parts into one table: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
 
     Gradients go to everything that is learned. A part with fewer coefficients than another is padded with zeros. The
-    C++
-    library needs one operation and one backward for all parts and instances. Triton runs one kernel per part, torch a
-    few dozen operations. Two runs agree to the last bit, except with torch on a GPU, which sums the gradients of poses
-    by atomics.
+    C++ library needs one operation and one backward for all parts and instances. Triton runs one kernel per part, torch
+    a few dozen operations. Two runs agree to the last bit, except with torch on a GPU, which sums the gradients of
+    poses by atomics.
 
     ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.backend.fused_backend`.
     """
@@ -29,11 +28,11 @@ def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "a
     if chosen == "cpu":
         from sparsestreet.ops.cpu.rows import activate as cpu_activate
 
-        return cpu_activate(parts, sh_degree, OPACITY_LOGIT_LIMIT)
+        return cpu_activate(parts, sh_degree)
     if chosen == "triton":
         from sparsestreet.ops.triton.activate import activate as triton_activate
 
-        return triton_activate(parts, sh_degree, OPACITY_LOGIT_LIMIT)
+        return triton_activate(parts, sh_degree)
     return Gaussians.concatenate([_activated(part, part.terms(sh_degree)) for part in parts])
 
 

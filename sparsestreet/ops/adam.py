@@ -20,42 +20,6 @@ from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT
 
 
-def step_rows_in_library_(
-    parameter: Tensor,
-    gradient: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    refused: Tensor,
-    *,
-    width: int,
-    size: float,
-    root: float,
-    betas: tuple[float, float],
-    eps: float,
-    variant: int = FASTEST_VARIANT,
-) -> None:
-    """``adam.adam_rows_`` on contiguous tensors of one dtype; ``size`` and ``root`` are those of its AdamStep."""
-    rows = native.CAdamRows(
-        rows=parameter.numel() // width,
-        width=width,
-        parameter=parameter.data_ptr(),
-        gradient=gradient.data_ptr(),
-        exp_avg=exp_avg.data_ptr(),
-        exp_avg_sq=exp_avg_sq.data_ptr(),
-        share=1 - betas[0],
-        beta=betas[1],
-        square_share=1 - betas[1],
-        root=root,
-        eps=eps,
-        size=size,
-        threads=native.thread_count(),
-        refused=refused.data_ptr(),
-    )
-    native.load_library().splat_adam(parameter.dtype == torch.float64, variant, byref(rows))
-    # Autograd does not see what the library writes, but a graph that holds old values must refuse its backward pass.
-    increment_version((parameter, exp_avg, exp_avg_sq))
-
-
 @dataclass(frozen=True)
 class AdamStep:
     """The numbers of one step."""
@@ -69,14 +33,12 @@ class AdamStep:
     eps: float = 1e-15
 
     @property
-    def size(self) -> float:
-        """The learning rate divided by the first moment's bias correction."""
-        return self.lr / (1 - self.betas[0] ** self.count)
-
-    @property
-    def root(self) -> float:
-        """Square root of the second moment's bias correction."""
-        return math.sqrt(1 - self.betas[1] ** self.count)
+    def numbers(self) -> tuple[float, float, float, float, float, float]:
+        """Share of the gradient in the first moment; what the second one keeps, and the square's share; then the root
+        of its bias correction, epsilon, and the learning rate divided by the first moment's bias correction."""
+        first, second = self.betas
+        root = math.sqrt(1 - second**self.count)
+        return 1 - first, second, 1 - second, root, self.eps, self.lr / (1 - first**self.count)
 
 
 @torch.no_grad()
@@ -100,17 +62,14 @@ def adam_step_(
     if fused_backend(backend, parameter, exp_avg, exp_avg_sq, choices=("torch", "triton")) == "triton":
         from sparsestreet.ops.triton.adam import step_rows_
 
-        moments = (exp_avg, exp_avg_sq)
-        step_rows_(
-            parameter, gradient.contiguous(), *moments, visible.contiguous(),
-            size=step.size, root=step.root, betas=step.betas, eps=step.eps,
-        )  # fmt: skip
+        step_rows_(parameter, gradient.contiguous(), exp_avg, exp_avg_sq, visible.contiguous(), step.numbers)
         return
     rows = visible.nonzero()[:, 0]
+    share, beta, square_share, root, eps, size = step.numbers
     seen, value = gradient.index_select(0, rows), parameter.index_select(0, rows)
-    first = exp_avg.index_select(0, rows).lerp_(seen, 1 - step.betas[0])
-    second = exp_avg_sq.index_select(0, rows).mul_(step.betas[1]).addcmul_(seen, seen, value=1 - step.betas[1])
-    value.addcdiv_(first, second.sqrt().div_(step.root).add_(step.eps), value=-step.size)
+    first = exp_avg.index_select(0, rows).lerp_(seen, share)
+    second = exp_avg_sq.index_select(0, rows).mul_(beta).addcmul_(seen, seen, value=square_share)
+    value.addcdiv_(first, second.sqrt().div_(root).add_(eps), value=-size)
     for whole, part in ((parameter, value), (exp_avg, first), (exp_avg_sq, second)):
         whole.index_copy_(0, rows, part)
 
@@ -164,15 +123,29 @@ def adam_rows_(
     if chosen == "torch" or not all(one.is_contiguous() for one in (parameter, exp_avg, exp_avg_sq)):
         _in_torch(parameter, gradient, exp_avg, exp_avg_sq, refused, step, width)
         return
-    moments, step_rows_ = (exp_avg, exp_avg_sq), step_rows_in_library_
+    step_rows_ = _step_in_library_
     if chosen == "triton":
         from sparsestreet.ops.triton.adam import step_finite_rows_
 
         step_rows_ = step_finite_rows_
-    step_rows_(
-        parameter, gradient.contiguous(), *moments, refused,
-        width=width, size=step.size, root=step.root, betas=step.betas, eps=step.eps,
-    )  # fmt: skip
+    step_rows_(parameter, gradient.contiguous(), exp_avg, exp_avg_sq, refused, width, step.numbers)
+
+
+def _step_in_library_(
+    parameter: Tensor,
+    gradient: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    refused: Tensor,
+    width: int,
+    numbers: tuple[float, ...],
+) -> None:
+    tensors = native.pointers(parameter, gradient, exp_avg, exp_avg_sq)
+    threads, counted = native.thread_count(), refused.data_ptr()
+    rows = native.CAdamRows(parameter.numel() // width, width, *tensors, *numbers, threads, counted)
+    native.load_library().splat_adam(parameter.dtype == torch.float64, FASTEST_VARIANT, byref(rows))
+    # Autograd does not see what the library writes, but a graph that holds old values must refuse its backward pass.
+    increment_version((parameter, exp_avg, exp_avg_sq))
 
 
 def _in_torch(

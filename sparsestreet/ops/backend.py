@@ -19,10 +19,8 @@ def resolve_backend(name: str, device: torch.device) -> str:
     """Return ``name`` if it can run on ``device``, or for "auto" the fastest backend that can.
 
     "auto" takes "triton" on CUDA devices and "cpu" on the CPU; if they are missing, it takes "reference" and warns
-    once.
-    Raises ValueError for an unknown name or a device the backend does not run on. Raises RuntimeError with the remedy
-    if
-    the library of "cpu" is not built, or the package triton is not installed.
+    once. Raises ValueError for an unknown name or a device the backend does not run on. Raises RuntimeError with the
+    remedy if the library of "cpu" is not built, or the package triton is not installed.
 
     >>> resolve_backend("reference", torch.device("cpu"))
     'reference'
@@ -92,48 +90,36 @@ def fused_backend(backend: str, *tensors: Tensor, choices: tuple[str, ...] = CHO
     """
     if backend not in ("auto", *choices):
         raise ValueError(f"no backend {backend!r} of this step: choose one of {('auto', *choices)}")
+    kinds = {(tensor.dtype, tensor.device.type) for tensor in tensors}
+    for_library = kinds in ({(float32, "cpu")}, {(float64, "cpu")})
+    for_triton = all(tensor.dtype == float32 and tensor.is_contiguous() for tensor in tensors)
+    if backend == "auto":
+        if "cpu" in choices and for_library and find_library() is not None:
+            return "cpu"
+        if "triton" in choices and _on_gpu(tensors) and for_triton and has_triton():
+            return "triton"
+        return "torch"
     if backend == "cpu":
-        _require_library(tensors)
+        if not for_library:
+            raise ValueError(
+                f"backend 'cpu' takes float32 or float64 tensors on the CPU, got {kinds}: use backend='torch'"
+            )
+        if find_library() is None:
+            raise RuntimeError(f"backend 'cpu' needs the C++ library: {remedy()}")
     if backend == "triton":
-        _require_triton(tensors)
-    if backend != "auto":
-        return backend
-    if "cpu" in choices and _fit_library(tensors) and find_library() is not None:
-        return "cpu"
-    if "triton" in choices and _on_gpu(tensors) and _fit_triton(tensors) and has_triton():
-        return "triton"
-    return "torch"
+        if not has_triton():
+            raise RuntimeError(f"backend 'triton' needs the package triton: {TRITON_REMEDY}")
+        if not for_triton:
+            laid_out = [(tensor.dtype, tensor.stride()) for tensor in tensors]
+            raise ValueError(f"backend 'triton' takes contiguous float32 tensors, got {laid_out}: use backend='torch'")
+        device = tensors[0].device
+        if device.type != "cuda" and not _interpreting():
+            raise ValueError(f"backend 'triton' needs tensors on a CUDA device, got {device}: use backend='torch'")
+    return backend
 
 
 def _on_gpu(tensors: tuple[Tensor, ...]) -> bool:
     return {tensor.device.type for tensor in tensors} == {"cuda"}
-
-
-def _fit_library(tensors: tuple[Tensor, ...]) -> bool:
-    return {(tensor.dtype, tensor.device.type) for tensor in tensors} in ({(float32, "cpu")}, {(float64, "cpu")})
-
-
-def _fit_triton(tensors: tuple[Tensor, ...]) -> bool:
-    return all(tensor.dtype == float32 and tensor.is_contiguous() for tensor in tensors)
-
-
-def _require_library(tensors: tuple[Tensor, ...]) -> None:
-    if not _fit_library(tensors):
-        kinds = {(tensor.dtype, tensor.device.type) for tensor in tensors}
-        raise ValueError(f"backend 'cpu' takes float32 or float64 tensors on the CPU, got {kinds}: use backend='torch'")
-    if find_library() is None:
-        raise RuntimeError(f"backend 'cpu' needs the C++ library: {remedy()}")
-
-
-def _require_triton(tensors: tuple[Tensor, ...]) -> None:
-    if not has_triton():
-        raise RuntimeError(f"backend 'triton' needs the package triton: {TRITON_REMEDY}")
-    if not _fit_triton(tensors):
-        kinds = [(tensor.dtype, tensor.stride()) for tensor in tensors]
-        raise ValueError(f"backend 'triton' takes contiguous float32 tensors, got {kinds}: use backend='torch'")
-    device = tensors[0].device
-    if device.type != "cuda" and not _interpreting():
-        raise ValueError(f"backend 'triton' needs tensors on a CUDA device, got {device}: use backend='torch'")
 
 
 def _interpreting() -> bool:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from sparsestreet.ops.reference import check_dtype, on_screen
+from sparsestreet.ops.reference import on_screen
 from sparsestreet.ops.reference.projection import (
     COMPENSATION_FLOOR,
     Reason,
@@ -17,7 +17,7 @@ from sparsestreet.ops.reference.projection import (
     to_camera,
 )
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.validate import check_structure, check_values
+from sparsestreet.ops.validate import check_dtype, check_structure, check_values
 from sparsestreet.types import Camera, Gaussians
 
 _ALARMS = ("vanished", "overflowed", "identity_quaternion", "color_held")
@@ -49,7 +49,7 @@ class Guards:
     vanished: int = 0
     """Screen determinant too small, which happens only without blur. An alarm."""
     overflowed: int = 0
-    """Screen determinant beyond the dtype's range. An alarm."""
+    """Larger on the screen, or farther away, than the dtype can square. An alarm."""
     faint: int = 0
     """Peak alpha below ``alpha_min``, or below what float32 holds (2^-126)."""
     outside: int = 0

@@ -1,14 +1,14 @@
 """Gaussians as nodes store them: raw parameters, mask multipliers and the boxes of their instances."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 OPACITY_LOGIT_LIMIT = 15.0
 """sigmoid(15) = 1 - 3e-7. Beyond it float32 has no gradient left, and exp could overflow."""
-
-
 INPUTS, LEARNED = 11, 9
 """Number of a part's tensors, and how many of them, the first ones, are floating point with gradients."""
 
@@ -70,3 +70,13 @@ class RawGaussians:
     def terms(self, sh_degree: int) -> int:
         """Number of coefficients in use up to a degree; rows that store fewer use all of theirs."""
         return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])
+
+
+def split_parts(tensors: Sequence[Tensor | None]) -> list[tuple[slice, Inputs]]:
+    """Return the rows of each part among all, and its inputs; ``tensors``: the inputs of all parts in one row."""
+    found, start = [], 0
+    for i in range(0, len(tensors), INPUTS):
+        part = cast(Inputs, tuple(tensors[i : i + INPUTS]))
+        found.append((slice(start, start + len(part[0])), part))
+        start += len(part[0])
+    return found

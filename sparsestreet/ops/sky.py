@@ -14,8 +14,6 @@ from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.ops.validate import check_camera
 from sparsestreet.types import Camera
 
-BACKENDS = ("auto", "torch", "cpu", "triton")
-
 
 @disable_compile
 def over_sky(
@@ -51,8 +49,6 @@ def over_sky(
     >>> over_sky(torch.zeros(2, 2, 3), torch.full((2, 2), 0.75), blue, camera, transmittance_min=1e-4)[0, 0]
     tensor([0.0000, 0.0000, 0.2500])
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"no backend {backend!r} of the sky: choose one of {BACKENDS}")
     check_camera(camera)
     _check(rgb, alpha, texels, camera)
     rgb, alpha, texels = rgb.contiguous(), alpha.contiguous(), texels.contiguous()

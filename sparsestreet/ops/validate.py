@@ -28,6 +28,15 @@ _MOST_GOOD = 1 << 14
 _SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
 
 
+def check_dtype(gaussians: Gaussians, who: str) -> None:
+    """Raise ValueError, naming ``who`` computes, for dtypes other than float32 and float64."""
+    if gaussians.means.dtype not in (torch.float32, torch.float64):
+        raise ValueError(
+            f"{who} computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "
+            "with dataclasses.replace and .float()"
+        )
+
+
 def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | None) -> None:
     """Check shapes, dtypes, devices, the camera and a background on the host; raise ValueError.
 
@@ -52,25 +61,24 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
     if gaussians.sh.shape[1] not in (1, 4, 9, 16):
         raise ValueError(f"sh must hold 1, 4, 9 or 16 terms (degree 0 to 3), got {gaussians.sh.shape[1]}")
     check_camera(camera)
-    moved = gaussians.displacements
-    if moved is not None and (moved.shape != means.shape or moved.dtype != means.dtype or moved.device != means.device):
-        raise ValueError(
-            f"displacements must be {list(means.shape)} {means.dtype} on {means.device} like the means, got "
-            f"{list(moved.shape)} {moved.dtype} on {moved.device}: give one row of meters per Gaussian"
-        )
+    if gaussians.displacements is not None:
+        _check_like(means, "displacements", gaussians.displacements, means.shape, "give one row of meters per Gaussian")
     if background is not None:
         _check_background(background, camera, means)
 
 
-def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
-    """Check for one finite weight >= 0 per pixel, of the means' dtype and device; raise ValueError. Waits for a
-    GPU."""
-    shape = (camera.height, camera.width)
-    if tuple(weights.shape) != shape or weights.dtype != means.dtype or weights.device != means.device:
+def _check_like(means: Tensor, name: str, values: Tensor, shape: tuple[int, ...], remedy: str) -> None:
+    if values.shape != shape or values.dtype != means.dtype or values.device != means.device:
         raise ValueError(
-            f"pixel_weights must be {list(shape)} {means.dtype} on {means.device}, got {list(weights.shape)} "
-            f"{weights.dtype} on {weights.device}: give one weight per pixel of the camera"
+            f"{name} must be {list(shape)} {means.dtype} on {means.device} like the means, got {list(values.shape)} "
+            f"{values.dtype} on {values.device}: {remedy}"
         )
+
+
+def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
+    """Check for one finite weight >= 0 per pixel, like the means; raise ValueError. Waits for a GPU."""
+    shape = (camera.height, camera.width)
+    _check_like(means, "pixel_weights", weights, shape, "give one weight per pixel of the camera")
     # NaN compares false.
     _raise_in_image("pixel_weights", weights, (weights >= 0) & (weights < math.inf), "must be finite and >= 0")
 
@@ -79,11 +87,7 @@ def check_gates(gates: Tensor, means: Tensor) -> None:
     """Check for one gate in [0, 1] per row, of the means' dtype and device; raise ValueError.
 
     As those of a background, values on a GPU are not checked, which would wait for it."""
-    if gates.shape != means.shape[:1] or gates.dtype != means.dtype or gates.device != means.device:
-        raise ValueError(
-            f"gates must be [{means.shape[0]}] {means.dtype} on {means.device} like the means, got "
-            f"{list(gates.shape)} {gates.dtype} on {gates.device}: give one factor per Gaussian"
-        )
+    _check_like(means, "gates", gates, means.shape[:1], "give one factor per Gaussian")
     if gates.device.type == "cpu":
         values = gates.detach()
         inside = (values >= 0) & (values <= 1)

@@ -35,7 +35,7 @@ def _dtypes(backend: str) -> tuple[torch.dtype, ...]:
     return (torch.float32,) if backend in SINGLE_PRECISION else (torch.float32, torch.float64)
 
 
-def _each(backends: tuple[str, ...], *, in_every_precision: bool) -> pytest.MarkDecorator:
+def _each(backends: tuple[str, ...], *, in_every_precision: bool, doubles_wait: bool = True) -> pytest.MarkDecorator:
     """Float64 waits for ``make test-all`` where float32, in which training runs, is tested as well."""
     cases = []
     for backend in backends:
@@ -43,7 +43,7 @@ def _each(backends: tuple[str, ...], *, in_every_precision: bool) -> pytest.Mark
         if in_every_precision:
             for dtype in _dtypes(backend):
                 name = f"{backend}-{str(dtype).removeprefix('torch.')}"
-                other = [pytest.mark.slow] * (dtype == torch.float64)
+                other = [pytest.mark.slow] * (dtype == torch.float64 and doubles_wait)
                 cases.append(pytest.param(backend, dtype, marks=[*marks, *other], id=name))
         else:
             cases.append(pytest.param(backend, marks=marks))
@@ -57,6 +57,8 @@ every_precision = _each(BACKENDS, in_every_precision=True)
 every_double = _each(_DOUBLE_BACKENDS, in_every_precision=False)
 every_fast_backend = _each(_FAST_BACKENDS, in_every_precision=False)
 every_fast_precision = _each(_FAST_BACKENDS, in_every_precision=True)
+every_fast_kind = _each(_FAST_BACKENDS, in_every_precision=True, doubles_wait=False)
+"""Of quick tests."""
 
 
 def first_interpreted(first: Any, *others: Any) -> list[Any]:

@@ -39,7 +39,7 @@ STEPS = {
     "ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
 }
 PLACES = {
-    "adam": {"cpu": "adam.step_rows_in_library_", "triton": "triton.adam.step_finite_rows_"},
+    "adam": {"cpu": "adam._step_in_library_", "triton": "triton.adam.step_finite_rows_"},
     "activate": {"cpu": "cpu.rows.activate", "triton": "triton.activate.activate"},
     "poses": {"cpu": "cpu.rows.poses_at", "triton": "triton.poses.poses_at"},
     "sky": {"cpu": "cpu.images.over_sky", "triton": "triton.sky.over_sky"},

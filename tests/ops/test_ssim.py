@@ -228,7 +228,7 @@ def test_what_the_library_does_not_take_is_torchs():
 
 def test_backends_that_cannot_run(monkeypatch):
     image, truth = noise(12, 13)
-    with pytest.raises(ValueError, match=r"no backend 'cuda' of SSIM: choose one of .*'cpu'"):
+    with pytest.raises(ValueError, match=r"no backend 'cuda' of this step: choose one of .*'cpu'"):
         ssim(image, truth, backend="cuda")
     monkeypatch.setattr(fused, "find_library", lambda: None)
     with pytest.raises(RuntimeError, match="'cpu' needs the C\\+\\+ library: install a C\\+\\+17 compiler"):

@@ -58,7 +58,7 @@ class _OverSky(torch.autograd.Function):
             cotangent = v_out.contiguous()
             native.load_library().splat_over_sky_backward(
                 alpha.dtype == torch.float64, ctx.variant, byref(sky), alpha.data_ptr(), cotangent.data_ptr(),
-                *(None if gradient is None else gradient.data_ptr() for gradient in (v_alpha, v_texels)),
+                native.pointer(v_alpha), native.pointer(v_texels),
             )  # fmt: skip
             return v_out, v_alpha, v_texels, None, None, None
 
@@ -73,7 +73,7 @@ def _sky(texels: Tensor, camera: Camera, transmittance_min: float, directions: T
         threads=native.thread_count(),
         bordered=bordered_texels(texels.shape[1], texels.device).data_ptr(),
         texels=texels.data_ptr(),
-        directions=None if directions is None else directions.data_ptr(),
+        directions=native.pointer(directions),
     )
 
 

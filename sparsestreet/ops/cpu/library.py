@@ -8,10 +8,8 @@ from ctypes import c_double, c_int32, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
-import torch
-
-# torch first: the library then shares torch's OpenMP runtime and its threads.
-
+import torch  # before the library, which then shares torch's OpenMP runtime and its threads
+from torch import Tensor
 
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
@@ -54,38 +52,6 @@ class CRows(ctypes.Structure):
     )
 
 
-class CLayers(ctypes.Structure):
-    """Pointers to the layers of an image, or to their cotangents."""
-
-    _fields_ = tuple((name, c_void_p) for name in ("rgb", "transmittance", "depth_sum"))
-
-
-class CRowGradients(ctypes.Structure):
-    """Pointers to the gradients of the Gaussians' fields, of the screen offsets and of the gates, if there are any."""
-
-    _fields_ = tuple(
-        (name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "screen", "gates")
-    )
-
-
-class CCounters(ctypes.Structure):
-    """Pointers to the contribution counters."""
-
-    _fields_ = tuple((name, c_void_p) for name in ("weight", "pixels", "dominant"))
-
-
-class CBackdrop(ctypes.Structure):
-    """Pointers to the background and to the weights of pixels; null: black, and 1."""
-
-    _fields_ = tuple((name, c_void_p) for name in ("rgb", "pixel_weights"))
-
-
-class CChanges(ctypes.Structure):
-    """Pointers to the changes when each row is removed."""
-
-    _fields_ = tuple((name, c_void_p) for name in ("largest", "squared"))
-
-
 class CSky(ctypes.Structure):
     """A cube map behind an image and the camera that sees it."""
 
@@ -111,21 +77,6 @@ class CRawRows(ctypes.Structure):
     )
 
 
-class CActiveRows(ctypes.Structure):
-    """Pointers to activated rows, or to their gradients."""
-
-    _fields_ = tuple((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh"))
-
-
-class CRawGradients(ctypes.Structure):
-    """Pointers to the gradients of stored rows and of the poses of their instances."""
-
-    _fields_ = (
-        *((name, c_void_p) for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")),
-        *((name, c_void_p) for name in ("multipliers", "pose_quaternions", "pose_translations")),
-    )
-
-
 class CKeyframes(ctypes.Structure):
     """Pointers to the tables of trajectories and of their corrections, and the time."""
 
@@ -134,15 +85,6 @@ class CKeyframes(ctypes.Structure):
         *((name, c_void_p) for name in ("times", "quaternions", "translations", "valid", "spans")),
         *((name, c_void_p) for name in ("rotation_deltas", "translation_deltas")),
         *((name, c_double) for name in ("time", "max_gap", "tolerance")),
-    )
-
-
-class CInstancePoses(ctypes.Structure):
-    """Pointers to poses and to what their gradients need."""
-
-    _fields_ = (
-        *((name, c_void_p) for name in ("quaternions", "translations", "present")),
-        *((name, c_void_p) for name in ("slopes", "fractions", "keyframes")),
     )
 
 
@@ -174,6 +116,18 @@ class CReport(ctypes.Structure):
     """Number of (splat, tile) pairs and the rows with most of them."""
 
     _fields_ = (("pairs", c_int64), ("worst_rows", c_int64 * 3), ("worst_pairs", c_int64 * 3))
+
+
+def pointer(tensor: Tensor | None) -> int | None:
+    """Return the address of a tensor's numbers; None, which is null in C, if it is missing."""
+    return None if tensor is None else tensor.data_ptr()
+
+
+def pointers(*tensors: Tensor | None) -> ctypes.Array[c_void_p]:
+    """Return the addresses of tensors as an array, which C sees as one of its structs of pointers alone.
+
+    Their order is that of src/interface.h. Layers, counters, changes and all gradients are such structs."""
+    return (c_void_p * len(tensors))(*map(pointer, tensors))
 
 
 def remedy() -> str:

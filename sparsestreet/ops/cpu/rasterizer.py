@@ -1,6 +1,6 @@
 """The C++ backend as an autograd function over torch tensors."""
 
-from ctypes import byref, c_double
+from ctypes import Array, byref, c_double, c_void_p
 
 import torch
 from jaxtyping import Float
@@ -13,11 +13,10 @@ from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
 from sparsestreet.ops.raster import PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.validate import check_values
+from sparsestreet.ops.validate import check_dtype, check_values
 from sparsestreet.phases import phase
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
-DTYPES = (torch.float32, torch.float64)
 PAIR_LIMIT = 1 << 28
 """Most (splat, tile) pairs of one rendering. A pair takes 24 bytes forward and 48 more backward in float32.
 
@@ -40,33 +39,18 @@ def rasterize(
     ``every_tile`` lists each splat in every tile and visits all lines of the tile, as a check of the lists. It is slow,
     and gives the same layers and infinite radii.
     """
-    _check_dtype(gaussians)
+    check_dtype(gaussians, "backend 'cpu'")
     g = gaussians
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     view = _view(camera, settings, every_tile)
     return Raster(*_Blend.apply(*fields, screen_offsets, gates, _moved(g), view, variant))
 
 
-def contribution(
-    gaussians: Gaussians, camera: Camera, settings: SplatSettings, variant: int = FASTEST_VARIANT
-) -> Contribution:
+def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
-    _check_dtype(gaussians)
-    g = gaussians
-    fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
-    displacements = _moved(g)
-    lease, report = Lease(g.means.dtype, variant), native.CReport()
-    weight = torch.empty(len(g), dtype=torch.float64)
-    pixels, dominant = torch.empty(2, len(g), dtype=torch.int64)
-    counters = native.CCounters(weight.data_ptr(), pixels.data_ptr(), dominant.data_ptr())
-    status = native.load_library().splat_contribution(
-        lease.workspace.handle,
-        byref(_view(camera, settings)),
-        byref(_rows(fields, displacements)),
-        byref(counters),
-        byref(report),
-    )
-    _raise_for(status, fields, displacements, report)
+    weight = torch.empty(len(gaussians), dtype=torch.float64)
+    pixels, dominant = torch.empty(2, len(gaussians), dtype=torch.int64)
+    _measure("splat_contribution", gaussians, camera, settings, native.pointers(weight, pixels, dominant))
     return Contribution(weight, pixels, dominant)
 
 
@@ -76,26 +60,32 @@ def leave_one_out(
     pixel_weights: Float[Tensor, "h w"] | None,
     camera: Camera,
     settings: SplatSettings,
-    variant: int = FASTEST_VARIANT,
 ) -> LeaveOneOut:
     """How much the view changes when each row alone is removed."""
-    _check_dtype(gaussians)
+    largest, squared = torch.empty(2, len(gaussians), dtype=torch.float64)
+    behind, counts = (None if layer is None else layer.detach().contiguous() for layer in (background, pixel_weights))
+    backdrop, changes = native.pointers(behind, counts), native.pointers(largest, squared)
+    _measure("splat_leave_one_out", gaussians, camera, settings, backdrop, changes)
+    return LeaveOneOut(largest, squared)
+
+
+def _measure(
+    function: str, gaussians: Gaussians, camera: Camera, settings: SplatSettings, *structs: Array[c_void_p]
+) -> None:
+    """Call a function of the library that writes what it measures of each row to where ``structs`` point."""
+    check_dtype(gaussians, "backend 'cpu'")
     g = gaussians
     fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
     displacements = _moved(g)
-    lease, report = Lease(g.means.dtype, variant), native.CReport()
-    largest, squared = torch.empty(2, len(g), dtype=torch.float64)
-    behind = [None if layer is None else layer.detach().contiguous() for layer in (background, pixel_weights)]
-    status = native.load_library().splat_leave_one_out(
+    lease, report = Lease(g.means.dtype, FASTEST_VARIANT), native.CReport()
+    status = getattr(native.load_library(), function)(
         lease.workspace.handle,
         byref(_view(camera, settings)),
         byref(_rows(fields, displacements)),
-        byref(native.CBackdrop(*(None if layer is None else layer.data_ptr() for layer in behind))),
-        byref(native.CChanges(largest.data_ptr(), squared.data_ptr())),
+        *map(byref, structs),
         byref(report),
     )
     _raise_for(status, fields, displacements, report)
-    return LeaveOneOut(largest, squared)
 
 
 class _Blend(torch.autograd.Function):
@@ -114,7 +104,7 @@ class _Blend(torch.autograd.Function):
             lease.workspace.handle,
             byref(view),
             byref(_rows(fields, displacements, gates)),
-            byref(_layers(rgb, transmittance, depth_sum)),
+            byref(native.pointers(rgb, transmittance, depth_sum)),
             radii.data_ptr(),
             byref(report),
         )
@@ -138,19 +128,11 @@ class _Blend(torch.autograd.Function):
                 byref(ctx.view),
                 byref(_rows(fields, displacements, gates)),
                 transmittance.data_ptr(),
-                byref(_layers(*cotangents)),
-                byref(native.CRowGradients(*(_pointer(one) for one in (*gradients, screen, of_gates)))),
+                byref(native.pointers(*cotangents)),
+                byref(native.pointers(*gradients, screen, of_gates)),
             )
         _raise_for(status, fields, displacements, native.CReport())
         return *gradients, screen, of_gates, None, None, None
-
-
-def _check_dtype(gaussians: Gaussians) -> None:
-    if gaussians.means.dtype not in DTYPES:
-        raise ValueError(
-            f"backend 'cpu' computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians with "
-            "dataclasses.replace and .float(), or use backend='reference'"
-        )
 
 
 def _moved(gaussians: Gaussians) -> Tensor | None:
@@ -202,16 +184,7 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
 def _rows(
     fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None, gates: Tensor | None = None
 ) -> native.CRows:
-    pointers = (_pointer(field) for field in (*fields, displacements, gates))
-    return native.CRows(fields[0].shape[0], fields[4].shape[1], *pointers)
-
-
-def _pointer(tensor: Tensor | None) -> int | None:
-    return None if tensor is None else tensor.data_ptr()
-
-
-def _layers(*layers: Tensor | None) -> native.CLayers:
-    return native.CLayers(*map(_pointer, layers))
+    return native.CRows(fields[0].shape[0], fields[4].shape[1], *native.pointers(*fields, displacements, gates))
 
 
 def _raise_for(

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from ctypes import byref
-from dataclasses import dataclass
-from typing import cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,106 +11,70 @@ from torch.autograd.function import once_differentiable
 from sparsestreet.geometry.trajectories import TIME_TOLERANCE, Trajectories
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT
-from sparsestreet.ops.raw import INPUTS, LEARNED, Inputs, RawGaussians
+from sparsestreet.ops.raw import LEARNED, OPACITY_LOGIT_LIMIT, Inputs, RawGaussians, split_parts
 from sparsestreet.phases import phase
 from sparsestreet.types import Gaussians
 
-FIELDS = 6
-"""Number of fields: means, log-scales, quaternions, opacity logits, first coefficient, the others."""
 
-
-def activate(
-    parts: Sequence[RawGaussians], sh_degree: int, logit_limit: float, variant: int = FASTEST_VARIANT
-) -> Gaussians:
+def activate(parts: Sequence[RawGaussians], sh_degree: int, variant: int = FASTEST_VARIANT) -> Gaussians:
     """``sparsestreet.ops.activate`` in C++, bitwise the same for any number of threads."""
     terms = [part.terms(sh_degree) for part in parts]
     tensors = [tensor for part in parts for tensor in part.tensors()]
-    return Gaussians(*_Activate.apply(_Call(terms, logit_limit, variant), *tensors))
-
-
-@dataclass(frozen=True)
-class _Call:
-    """What all parts share, and the number of coefficients of each."""
-
-    terms: list[int]
-    logit_limit: float
-    variant: int
+    return Gaussians(*_Activate.apply(terms, variant, *tensors))
 
 
 class _Activate(torch.autograd.Function):
     """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities, coefficients."""
 
     @staticmethod
-    def forward(ctx, call, *given):
+    def forward(ctx, terms, variant, *given):
         tensors = [None if tensor is None else tensor.contiguous() for tensor in given]
-        means = given[0]
-        n = sum(len(part[0]) for part in _parts(tensors))
-        widths = ((3,), (4,), (3,), (), (max(call.terms), 3))
-        outputs = [means.new_empty(n, *width) for width in widths]
-        for rows, part, terms in _walk(tensors, call):
-            status = native.load_library().splat_activate(
-                int(means.dtype == torch.float64), call.variant, byref(_rows(part, terms, call)),
-                byref(native.CActiveRows(*_pointers([output[rows] for output in outputs]))),
-            )  # fmt: skip
-            _raise_for(status)
         ctx.save_for_backward(*tensors)
-        ctx.call = call
+        ctx.terms, ctx.kind = terms, (given[0].dtype == torch.float64, variant)
+        parts = split_parts(tensors)
+        count, stride = parts[-1][0].stop, max(terms)
+        outputs = [given[0].new_empty(count, *width) for width in ((3,), (4,), (3,), (), (stride, 3))]
+        for (rows, part), used in zip(parts, terms, strict=True):
+            active = native.pointers(*(output[rows] for output in outputs))
+            _raise_for(native.load_library().splat_activate(*ctx.kind, byref(_rows(part, used, stride)), byref(active)))
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *cotangents):
-        call, gradients = ctx.call, []
+        gradients = []
         with phase("scene backward"):
             cotangents = [value.contiguous() for value in cotangents]
-            for rows, part, terms in _walk(ctx.saved_tensors, call):
-                gradients += _part_backward(part, terms, call, [value[rows] for value in cotangents])
-        return None, *gradients
+            for (rows, part), used in zip(split_parts(ctx.saved_tensors), ctx.terms, strict=True):
+                gradients += _part_backward(ctx, part, used, [value[rows] for value in cotangents])
+        return None, None, *gradients
 
 
-def _part_backward(part: Inputs, terms: int, call: _Call, cotangents: list[Tensor]) -> list[Tensor | None]:
+def _part_backward(ctx, part: Inputs, terms: int, cotangents: list[Tensor]) -> list[Tensor | None]:
     """Gradients of a part's inputs from those of its rows."""
     gradients: list[Tensor | None] = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:LEARNED]]
-    if part[LEARNED] is None:
+    placed = part[LEARNED] is not None
+    if not placed:
         # Means and quaternions passed through unchanged.
         gradients[0] = gradients[2] = None
     # As in torch, so that an optimizer skips coefficients that are not in use yet.
     if terms == 1:
-        gradients[FIELDS - 1] = None
-    status = native.load_library().splat_activate_backward(
-        int(part[0].dtype == torch.float64), call.variant, byref(_rows(part, terms, call)),
-        byref(native.CActiveRows(*_pointers(cotangents))), byref(native.CRawGradients(*_pointers(gradients))),
-    )  # fmt: skip
-    _raise_for(status)
-    if part[LEARNED] is None:
+        gradients[5] = None
+    active, raw = native.pointers(*cotangents), native.pointers(*gradients)
+    rows = _rows(part, terms, max(ctx.terms))
+    _raise_for(native.load_library().splat_activate_backward(*ctx.kind, byref(rows), byref(active), byref(raw)))
+    if not placed:
         gradients[0], gradients[2] = cotangents[:2]
     return [*gradients, None, None]
 
 
-def _parts(tensors: Sequence[Tensor | None]) -> list[Inputs]:
-    return [cast(Inputs, tuple(tensors[start : start + INPUTS])) for start in range(0, len(tensors), INPUTS)]
-
-
-def _walk(tensors: Sequence[Tensor | None], call: _Call) -> list[tuple[slice, Inputs, int]]:
-    """For each part its rows in the table, its inputs, and its number of coefficients."""
-    found, start = [], 0
-    for part, terms in zip(_parts(tensors), call.terms, strict=True):
-        found.append((slice(start, start + len(part[0])), part, terms))
-        start += len(part[0])
-    return found
-
-
-def _rows(part: Inputs, terms: int, call: _Call) -> native.CRawRows:
+def _rows(part: Inputs, terms: int, stride: int) -> native.CRawRows:
     *fields, multipliers, turns, shifts, instances, present = part
     return native.CRawRows(
-        fields[0].shape[0], fields[-1].shape[1], terms, max(call.terms), call.logit_limit,
-        *_pointers([*fields, multipliers, instances]), 0 if turns is None else turns.shape[0],
-        *_pointers([turns, shifts, present]), native.thread_count(),
+        fields[0].shape[0], fields[-1].shape[1], terms, stride, OPACITY_LOGIT_LIMIT,
+        *native.pointers(*fields, multipliers, instances), 0 if turns is None else turns.shape[0],
+        *native.pointers(turns, shifts, present), native.thread_count(),
     )  # fmt: skip
-
-
-def _pointers(tensors: Sequence[Tensor | None]) -> list[int | None]:
-    return [None if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
 def _raise_for(status: int) -> None:
@@ -151,15 +113,10 @@ class _Poses(torch.autograd.Function):
         slopes = torch.empty(instances, 4, _INPUTS, dtype=torch.float64)
         fractions = torch.empty(instances, dtype=torch.float64)
         places = torch.empty(instances, 2, dtype=torch.int64)
+        keyframes = native.CKeyframes(instances, length, *native.pointers(*tensors), time, max_gap, TIME_TOLERANCE)
+        poses = native.pointers(quaternions, translations, present, slopes, fractions, places)
         native.load_library().splat_poses(
-            int(rotation_deltas.dtype == torch.float64),
-            variant,
-            byref(
-                native.CKeyframes(
-                    instances, length, *(tensor.data_ptr() for tensor in tensors), time, max_gap, TIME_TOLERANCE
-                )
-            ),
-            byref(_pointers_poses(quaternions, translations, present, slopes, fractions, places)),
+            rotation_deltas.dtype == torch.float64, variant, byref(keyframes), byref(poses)
         )
         ctx.mark_non_differentiable(present)
         ctx.save_for_backward(slopes, fractions, places)
@@ -180,14 +137,8 @@ class _Poses(torch.autograd.Function):
         ]
         rotation_deltas, translation_deltas = some.new_zeros(ctx.shape), some.new_zeros(ctx.shape)
         native.load_library().splat_poses_backward(
-            int(some.dtype == torch.float64),
-            ctx.variant,
-            instances,
-            byref(_pointers_poses(None, None, None, slopes, fractions, places)),
-            *(tensor.data_ptr() for tensor in (*cotangents, rotation_deltas, translation_deltas)),
-        )
+            some.dtype == torch.float64, ctx.variant, instances,
+            byref(native.pointers(None, None, None, slopes, fractions, places)),
+            *native.pointers(*cotangents, rotation_deltas, translation_deltas),
+        )  # fmt: skip
         return rotation_deltas, translation_deltas, None, None, None, None
-
-
-def _pointers_poses(*tensors: Tensor | None) -> native.CInstancePoses:
-    return native.CInstancePoses(*(None if tensor is None else tensor.data_ptr() for tensor in tensors))

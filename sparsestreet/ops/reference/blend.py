@@ -10,9 +10,9 @@ from torch.utils.checkpoint import checkpoint
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
+from sparsestreet.ops.validate import check_dtype
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
-DTYPES = (torch.float32, torch.float64)
 _CHUNK_ELEMENTS = 1 << 20
 
 
@@ -25,7 +25,7 @@ def rasterize(
     gates: Float[Tensor, " n"] | None = None,
 ) -> Raster:
     """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
-    check_dtype(gaussians)
+    check_dtype(gaussians, "backend 'reference'")
     # The op is not differentiable in the camera, even where its tensors ask for a gradient.
     camera = replace(camera, camera_from_world=camera.camera_from_world.detach(), intrinsics=camera.intrinsics.detach())
     rows = visible_rows(gaussians, camera, settings)
@@ -54,7 +54,7 @@ def rasterize(
 @torch.no_grad()
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
     """Blend weights, touched pixels and dominated pixels per row of one view."""
-    check_dtype(gaussians)
+    check_dtype(gaussians, "backend 'reference'")
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     weight = torch.zeros(len(gaussians), dtype=torch.float64, device=rows.device)
@@ -81,7 +81,7 @@ def leave_one_out(
     settings: SplatSettings,
 ) -> LeaveOneOut:
     """The change of the view without each row: -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha)."""
-    check_dtype(gaussians)
+    check_dtype(gaussians, "backend 'reference'")
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
     largest, squared = torch.zeros(2, len(gaussians), dtype=torch.float64, device=rows.device)
@@ -107,15 +107,6 @@ def leave_one_out(
         squared[rows] += change.double().square().sum(2) @ pixel_weights.reshape(-1)[here].double()
         begin += len(chunk)
     return LeaveOneOut(largest, squared)
-
-
-def check_dtype(gaussians: Gaussians, who: str = "backend 'reference'") -> None:
-    """Raise ValueError, naming ``who`` computes, for dtypes other than float32 and float64."""
-    if gaussians.means.dtype not in DTYPES:
-        raise ValueError(
-            f"{who} computes in float32 or float64, got {gaussians.means.dtype}: convert the Gaussians "
-            "with dataclasses.replace and .float()"
-        )
 
 
 def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:

@@ -7,7 +7,6 @@ atomics two runs agree to the last bit.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -16,7 +15,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 from triton.runtime.jit import KernelInterface
 
-from sparsestreet.ops.raw import INPUTS, RawGaussians
+from sparsestreet.ops.raw import OPACITY_LOGIT_LIMIT, Inputs, RawGaussians, split_parts
 from sparsestreet.ops.triton.launch import constant, jit, launch
 from sparsestreet.ops.triton.quaternions import (
     conjugate,
@@ -40,24 +39,24 @@ COLUMNS = constant(16)
 """How many numbers of a row are copied at once."""
 
 
-def activate(parts: Sequence[RawGaussians], sh_degree: int, logit_limit: float) -> Gaussians:
+def activate(parts: Sequence[RawGaussians], sh_degree: int) -> Gaussians:
     """``sparsestreet.ops.activate`` of contiguous float32 tensors."""
     terms = max(part.terms(sh_degree) for part in parts)
     tensors = [tensor for part in parts for tensor in part.tensors()]
-    return Gaussians(*_Activate.apply(terms, logit_limit, *tensors))
+    return Gaussians(*_Activate.apply(terms, *tensors))
 
 
 class _Activate(torch.autograd.Function):
     """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities, coefficients."""
 
     @staticmethod
-    def forward(ctx, terms, logit_limit, *tensors):
-        ctx.terms, ctx.logit_limit = terms, logit_limit
+    def forward(ctx, terms, *tensors):
+        ctx.terms = terms
         ctx.save_for_backward(*tensors)
-        rows = sum(len(means) for means in tensors[::INPUTS])
-        outputs = [tensors[0].new_empty(rows, *width) for width in ((3,), (4,), (3,), (), (terms, 3))]
-        for part in _parts(tensors):
-            _launch(activate_rows, ctx, part, *outputs)
+        parts = split_parts(tensors)
+        outputs = [tensors[0].new_empty(parts[-1][0].stop, *width) for width in ((3,), (4,), (3,), (), (terms, 3))]
+        for rows, part in parts:
+            _launch(activate_rows, terms, rows, part, *outputs)
         return tuple(outputs)
 
     @staticmethod
@@ -65,58 +64,42 @@ class _Activate(torch.autograd.Function):
     def backward(ctx, *cotangents):
         cotangents = [value.contiguous() for value in cotangents]
         gradients = []
-        for part in _parts(ctx.saved_tensors):
-            gradients += _part_backward(ctx, part, cotangents)
-        return None, None, *gradients
+        for rows, part in split_parts(ctx.saved_tensors):
+            gradients += _part_backward(ctx.terms, rows, part, cotangents)
+        return None, *gradients
 
 
-@dataclass(frozen=True)
-class _Part:
-    """The inputs of a part, and its rows among all."""
-
-    tensors: Sequence[Tensor | None]
-    rows: slice
-
-
-def _parts(tensors: Sequence[Tensor | None]) -> list[_Part]:
-    found, start = [], 0
-    for i in range(0, len(tensors), INPUTS):
-        found.append(_Part(tensors[i : i + INPUTS], slice(start, start + len(tensors[i]))))
-        start = found[-1].rows.stop
-    return found
-
-
-def _part_backward(ctx, part: _Part, cotangents: list[Tensor]) -> list[Tensor | None]:
+def _part_backward(terms: int, rows: slice, part: Inputs, cotangents: list[Tensor]) -> list[Tensor | None]:
     """Gradients of a part's inputs from those of all rows."""
-    means, turns = part.tensors[0], part.tensors[7]
-    gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part.tensors[:7]]
+    means, turns = part[0], part[7]
+    gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:7]]
     if turns is None:
         # Means and quaternions passed through unchanged.
         gradients[0] = gradients[2] = None
     # As in torch, so that an optimizer skips coefficients that are not in use yet.
-    if min(ctx.terms, 1 + part.tensors[5].shape[1]) == 1:
+    if min(terms, 1 + part[5].shape[1]) == 1:
         gradients[5] = None
     # One line per program: four numbers of each instance's quaternion, then three of each translation.
     count = 0 if turns is None else len(turns)
     sums = means if turns is None else means.new_zeros(-(-len(means) // LANES), 7 * count)
     written = [means if value is None else value for value in gradients]
-    _launch(activate_rows_backward, ctx, part, *cotangents, *written, sums, count)
+    _launch(activate_rows_backward, terms, rows, part, *cotangents, *written, sums, count)
     if turns is None:
-        gradients[0], gradients[2] = cotangents[0][part.rows], cotangents[1][part.rows]
+        gradients[0], gradients[2] = cotangents[0][rows], cotangents[1][rows]
         return [*gradients, None, None, None, None]
     v_turns, v_shifts = sums.sum(0).split((4 * count, 3 * count))
     return [*gradients, v_turns.view(-1, 4), v_shifts.view(-1, 3), None, None]
 
 
-def _launch(kernel: KernelInterface, ctx, part: _Part, *others: Tensor | int) -> None:
-    *floats, instances, present = part.tensors
+def _launch(kernel: KernelInterface, terms: int, rows: slice, part: Inputs, *others: Tensor | int) -> None:
+    *floats, instances, present = part
     means, placed = floats[0], present is not None
     # Means replace arguments that are not read: multipliers without a mask, and poses without a placement.
     floats = [means if tensor is None else tensor for tensor in floats]
     indices = (instances.contiguous(), present.contiguous().view(torch.uint8)) if placed else (means, means)
     launch(
-        kernel, len(means), LANES, *floats, *indices, *others, part.rows.start, len(means), ctx.logit_limit,
-        TERMS=ctx.terms, STORED=1 + floats[5].shape[1], MASKED=part.tensors[6] is not None, PLACED=placed,
+        kernel, len(means), LANES, *floats, *indices, *others, rows.start, len(means), OPACITY_LOGIT_LIMIT,
+        TERMS=terms, STORED=1 + floats[5].shape[1], MASKED=part[6] is not None, PLACED=placed,
     )  # fmt: skip
 
 

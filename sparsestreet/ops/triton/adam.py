@@ -23,20 +23,15 @@ def step_rows_(
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
     visible: Tensor,
-    *,
-    size: float,
-    root: float,
-    betas: tuple[float, float],
-    eps: float,
+    step: tuple[float, ...],
 ) -> None:
-    """``adam_step_`` on contiguous float32 tensors; ``size`` and ``root`` are those of its AdamStep."""
+    """``adam.adam_step_`` on contiguous float32 tensors; ``step``: the numbers of its AdamStep."""
     numbers = parameter.numel()
     if not numbers:
         return
     launch(
         step_numbers, numbers, LANES,
-        parameter, gradient, exp_avg, exp_avg_sq, visible.view(uint8), numbers,
-        1 - betas[0], betas[1], 1 - betas[1], root, eps, size,
+        parameter, gradient, exp_avg, exp_avg_sq, visible.view(uint8), numbers, *step,
         ROW=numbers // len(parameter), options=OPTIONS,
     )  # fmt: skip
     # Autograd does not see what a kernel writes, but a graph that holds old values must refuse its backward pass.
@@ -81,19 +76,14 @@ def step_finite_rows_(
     exp_avg: Tensor,
     exp_avg_sq: Tensor,
     refused: Tensor,
-    *,
     width: int,
-    size: float,
-    root: float,
-    betas: tuple[float, float],
-    eps: float,
+    step: tuple[float, ...],
 ) -> None:
-    """``adam.adam_rows_`` on contiguous float32 tensors; ``size`` and ``root`` are those of its AdamStep."""
+    """``adam.adam_rows_`` on contiguous float32 tensors; ``step``: the numbers of its AdamStep."""
     rows, padded = parameter.numel() // width, triton.next_power_of_2(width)
     launch(
         step_finite_rows, rows, max(TABLE // padded, 1),
-        parameter, gradient, exp_avg, exp_avg_sq, refused, rows,
-        1 - betas[0], betas[1], 1 - betas[1], root, eps, size,
+        parameter, gradient, exp_avg, exp_avg_sq, refused, rows, *step,
         WIDTH=width, PADDED=padded, options=OPTIONS,
     )  # fmt: skip
     increment_version((parameter, exp_avg, exp_avg_sq))

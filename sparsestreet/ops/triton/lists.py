@@ -27,7 +27,6 @@ _FORGOTTEN = 128
 A view that comes back within 28 others still fits. Too little room costs about one forward pass, too much costs
 every sort."""
 _seen: dict[tuple, Room] = {}
-_repeated = 0
 
 
 def like(rows: int, view: KernelView, device: torch.device) -> tuple:
@@ -47,21 +46,6 @@ def remember(place: tuple, rows: int, pairs: int) -> None:
     """What a view took: visible rows and pairs."""
     before = _seen.get(place)
     _seen[place] = Room(rows, pairs) if before is None else Room(_faded(before.rows, rows), _faded(before.pairs, pairs))
-
-
-def repeated_forwards() -> int:
-    """How many forward passes of this process were done twice, because their view did not fit."""
-    return _repeated
-
-
-def count_repeated() -> None:
-    global _repeated
-    _repeated += 1
-
-
-def forget() -> None:
-    """Forget all views, as at the start of the process."""
-    _seen.clear()
 
 
 def _faded(before: int, taken: int) -> int:

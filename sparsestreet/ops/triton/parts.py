@@ -78,7 +78,10 @@ split moves images by rounding, as the light before a part is a product of other
 MIN_PART_PAIRS = 128
 """Least number of pairs of a part. It bounds what parts cost in small views."""
 MIN_PARTS = 3
-"""Parts of the shortest tile that is split. What a split costs is too much for two parts."""
+"""Parts of the shortest tile that is split. What a split costs is too much for two parts.
+
+Views of 2,400 tiles (960x640) or more of similar length have no split tile. A part does not know which of its pixels
+earlier parts have closed, so in an opaque tile it computes hidden splats once in vain."""
 
 
 @dataclass(frozen=True)
@@ -126,20 +129,6 @@ class PartLayers:
         return PartLayers(products, rgb, transmittance, depth_sum, parts.lasts)
 
 
-def part_length(pairs: int) -> int:
-    """Least number of pairs of a part, for a view with ``pairs``; parts of a tile differ by at most one."""
-    return max(MIN_PART_PAIRS, -(-pairs // MAX_PARTS))
-
-
-def split_length(pairs: int) -> int:
-    """Least number of pairs of a tile that is split, for a view with ``pairs``.
-
-    Views of 2,400 tiles (960x640) or more of similar length have no split tile. A part does not know which of its
-    pixels earlier parts have closed, so in an opaque tile it computes hidden splats once in vain.
-    """
-    return MIN_PARTS * part_length(pairs)
-
-
 def most_parts_of(room: int) -> int:
     """Most parts that up to ``room`` pairs of a view can need; 0 if no tile can be long enough for some."""
     most = min(MAX_PARTS, room // MIN_PART_PAIRS)
@@ -147,14 +136,9 @@ def most_parts_of(room: int) -> int:
     return -(-most // 4) * 4 if most >= MIN_PARTS else 0
 
 
-def split_rule() -> tuple[int, int, int]:
-    """Return least pairs of a part, most parts of a view, and fewest parts of a tile that is split."""
-    return MIN_PART_PAIRS, MAX_PARTS, MIN_PARTS
-
-
 @jit
 def shortest_split(pairs, shortest_part, most_parts, fewest_parts):
-    """As ``part_length`` and ``split_length``: of a part, and of a tile that is split."""
+    """Least number of pairs of a part, and of a tile that is split; parts of a tile differ by at most one."""
     length = tl.maximum(shortest_part, tl.cdiv(pairs, most_parts))
     return length, fewest_parts * length
 
@@ -222,7 +206,7 @@ def list_by_tile(
 
     It does not wait for the device: there is room for the most parts that this room of pairs could need."""
     room, blocks = keys.shape[0], -(-tiles // _BLOCK)
-    part_count, rule = most_parts_of(room), split_rule()
+    part_count = most_parts_of(room)
     scratch = _AHEAD + 2 * tiles + 2 * _CLASS_COUNT * blocks
     pair_rows, begins, ends, whole_ends, order, of_tiles, ahead, lasts, *part_vectors = vectors(
         keys, room, *(tiles,) * 5, scratch, part_count * PIXEL_COUNT, *(part_count,) * 5
@@ -230,7 +214,7 @@ def list_by_tile(
     launch(
         bound_tiles, max(room, tiles), _BLOCK,
         keys, slots, unsorted_rows, pair_rows, begins, ends, whole_ends, ahead, sizes.on_device,
-        tiles, blocks, room.bit_length(), *rule,
+        tiles, blocks, room.bit_length(), MIN_PART_PAIRS, MAX_PARTS, MIN_PARTS,
     )  # fmt: skip
     launch(
         order_tiles, max(tiles, part_count), _BLOCK,

@@ -22,49 +22,30 @@ _OPTIONS = {"enable_fp_fusion": False}
 LEAST = constant(MIN_ALPHA)
 
 
-@dataclass(frozen=True)
-class Composed:
-    """What backward needs of a composed image."""
-
-    transmittance: Float[Tensor, "h w"]
-    depth: Float[Tensor, "h w"]
-    background: Float[Tensor, "..."] | None
-    """[3] or [h, w, 3]."""
-
-
-@dataclass(frozen=True)
-class Split:
-    """Tiles whose pixels are still in parts."""
-
-    parts: Parts
-    layers: PartLayers
-    limit: float
-    """Light at which a pixel is finished."""
-
-
 def compose(
     rgb: Float[Tensor, "h w 3"],
     transmittance: Float[Tensor, "h w"],
     depth_sum: Float[Tensor, "h w"],
     background: Float[Tensor, "..."] | None,
     lasts: Int[Tensor, "h w"] | None = None,
-    split: Split | None = None,
+    split: tuple[Parts, PartLayers] | None = None,
+    limit: float = 0.0,
 ) -> Float[Tensor, "h w"]:
-    """Return alpha; put the background behind ``rgb`` and turn ``depth_sum`` into a depth, both in place.
+    """Return alpha; put the background [3] or [h, w, 3] behind ``rgb`` and turn ``depth_sum`` into a depth, both in
+    place.
 
-    The pixels of ``split`` tiles it first adds up from their parts, with where they end if ``lasts`` are given."""
+    The pixels of ``split`` tiles it first adds up from their parts, with where they end if ``lasts`` are given; at the
+    light ``limit`` a pixel is finished."""
     alpha, (height, width) = transmittance.new_empty(transmittance.shape), transmittance.shape
-    columns = -(-width // TILE_SIZE)
-    tables, limit = (rgb,) * 7, 0.0
+    columns, tables = -(-width // TILE_SIZE), (rgb,) * 7
     if split is not None:
-        part, limit = split.layers, split.limit
+        parts, part = split
         tables = (
-            split.parts.of_tiles, split.parts.nexts,
-            part.products, part.rgb, part.transmittance, part.depth_sum, part.lasts,
+            parts.of_tiles, parts.nexts, part.products, part.rgb, part.transmittance, part.depth_sum, part.lasts,
         )  # fmt: skip
     launch(
         compose_pixels, columns * -(-height // TILE_SIZE), 1,
-        rgb, transmittance, depth_sum, rgb if lasts is None else lasts, rgb if background is None else background,
+        rgb, transmittance, depth_sum, given_or(lasts, rgb), given_or(background, rgb),
         alpha, *tables, width, height, columns, limit,
         PARTS=split is not None, LASTS=split is not None and lasts is not None, **_behind(background), options=_OPTIONS,
     )  # fmt: skip
@@ -72,18 +53,23 @@ def compose(
 
 
 def decompose(
-    composed: Composed, v_rgb: Tensor, v_alpha: Tensor | None, v_depth: Tensor | None, background_too: bool
+    passed: Float[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
+    background: Float[Tensor, "..."] | None,
+    v_rgb: Tensor,
+    v_alpha: Tensor | None,
+    v_depth: Tensor | None,
+    background_too: bool,
 ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-    """Gradients of the transmittance, of the sum of depths (None: none was asked for), and of the background."""
-    passed, background = composed.transmittance, composed.background
+    """Gradients of the transmittance ``passed``, of the sum of depths (None: not asked for), and of the background."""
     if v_alpha is None and v_depth is None and background is None:
         return torch.zeros_like(passed), None, None
     v_passed, v_background = torch.empty_like(passed), torch.empty_like(v_rgb) if background_too else None
     v_depth_sum = None if v_depth is None else torch.empty_like(passed)
-    unread = [passed if given is None else given for given in (v_alpha, v_depth, background, v_background, v_depth_sum)]
+    unread = [given_or(given, passed) for given in (v_alpha, v_depth, background, v_background, v_depth_sum)]
     launch(
         decompose_pixels, passed.numel(), _BLOCK,
-        passed, composed.depth, v_rgb, *unread, v_passed, passed.numel(),
+        passed, depth, v_rgb, *unread, v_passed, passed.numel(),
         ALPHA=v_alpha is not None, DEPTH=v_depth is not None, COLORS=background_too, **_behind(background),
         options=_OPTIONS,
     )  # fmt: skip
@@ -196,15 +182,6 @@ class Layers:
     ends: Ends
 
 
-@dataclass(frozen=True)
-class Cotangents:
-    """Derivatives of the loss by what is blended, before it is composed; a missing one is 0."""
-
-    rgb: Float[Tensor, "h w 3"]
-    transmittance: Float[Tensor, "h w"]
-    depth_sum: Float[Tensor, "h w"] | None
-
-
 def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[Tensor, "..."] | None = None) -> Layers:
     """Blends all tiles over a background; ``lasts``: whether a backward pass will follow."""
     lists, shape, new = screen.lists, (view.camera.height, view.camera.width), screen.records.new_empty
@@ -215,7 +192,7 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
     if parts is not None:
         part = PartLayers.empty(parts, rgb)
         part_layers = (part.rgb, part.transmittance, part.depth_sum, part.lasts)
-        neighbors, split = (parts.firsts, parts.nexts, part.products), Split(parts, part, limit)
+        neighbors, split = (parts.firsts, parts.nexts, part.products), (parts, part)
     tables = (screen.records, lists.pair_rows, *work_tables(lists), *neighbors, *layers, *part_layers)
     numbers = (*sizes(view, parts), view.settings.alpha_max, limit)
     tiles, part_count = lists.order.shape[0], numbers[3]
@@ -234,31 +211,35 @@ def blend_view(screen: Screen, view: KernelView, lasts: bool, background: Float[
         # for the one before.
         blend_each(tiles + part_count, TOGETHER)
         blend_each(part_count, REST)
-    alpha = compose(rgb, transmittance, depth_sum, background, last, split)
+    alpha = compose(rgb, transmittance, depth_sum, background, last, split, limit)
     return Layers(rgb, alpha, depth_sum, Ends(transmittance, last, part))
 
 
 def differentiate_view(
-    screen: Screen, view: KernelView, ends: Ends, v: Cotangents, absolute: bool
+    screen: Screen,
+    view: KernelView,
+    ends: Ends,
+    v_rgb: Float[Tensor, "h w 3"],
+    v_transmittance: Float[Tensor, "h w"],
+    v_depth_sum: Float[Tensor, "h w"] | None,
+    absolute: bool,
 ) -> Float[Tensor, "p s"]:
     """Return a slot of gradients for each pair; ``absolute``: with the absolute gradients of the screen means."""
-    lists, depth, passed = screen.lists, v.depth_sum is not None, ends.transmittance
+    lists, depth, passed = screen.lists, v_depth_sum is not None, ends.transmittance
     slots = passed.new_empty(lists.sizes.pairs, gradients.slot_length(screen.gated))
     parts, part = lists.parts, ends.parts
     part_count = 0 if parts is None else len(parts)
     nexts, part_layers = lists.order, (passed, passed, passed, lists.order)
     if parts is not None and part is not None:
         nexts, part_layers = parts.nexts, (part.rgb, part.depth_sum, part.transmittance, part.lasts)
-
     launch(
         gradients.blend_tiles_backward, len(lists.order) + part_count, 1,
         screen.records, lists.pair_rows, lists.slots, *work_tables(lists), nexts, passed, ends.lasts, *part_layers,
-        v.rgb, v.transmittance, given_or(v.depth_sum, passed), slots,
+        v_rgb, v_transmittance, given_or(v_depth_sum, passed), slots,
         *sizes(view, parts), view.settings.alpha_max,
         DEPTH=depth, ABSOLUTE=absolute, GATED=screen.gated, TOGETHER=parts is not None,
         options=ONE_WARP | {"maxnreg": gradients.registers(depth, screen.gated)},
     )  # fmt: skip
-
     return slots
 
 

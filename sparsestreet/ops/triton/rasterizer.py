@@ -19,8 +19,6 @@ from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
 from sparsestreet.ops.triton.pixels import (
     ONE_WARP,
-    Composed,
-    Cotangents,
     Ends,
     blend_view,
     decompose,
@@ -126,16 +124,14 @@ class _Blend(torch.autograd.Function):
         *fields, transmittance, depth, background = ctx.saved_tensors
         screen, view, lists = ctx.screen, ctx.view, ctx.screen.lists
         v_rgb = transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous()
-        composed = Composed(transmittance, depth, background)
         v_passed, v_depth_sum, v_background = decompose(
-            composed, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[7]
+            transmittance, depth, background, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[7]
         )
         if not any(ctx.needs_input_grad[:7]):
             return *[None] * 7, v_background, None, None, None
-        cotangents, ends = Cotangents(v_rgb, v_passed, v_depth_sum), Ends(transmittance, ctx.lasts, ctx.parts)
-        plain = view.settings.plain_gradients
+        ends, plain = Ends(transmittance, ctx.lasts, ctx.parts), view.settings.plain_gradients
         absolute = ctx.needs_input_grad[5] and not plain
-        gradients = differentiate_view(screen, view, ends, cotangents, absolute)
+        gradients = differentiate_view(screen, view, ends, v_rgb, v_passed, v_depth_sum, absolute)
         sums = transmittance.new_empty(len(fields[0]), gradients.shape[1])
         _sum_slots(gradients, lists, sums, 16, tl.float32)
         outputs = [torch.empty_like(field) for field in fields]

@@ -15,7 +15,6 @@ from sparsestreet.ops.triton.lists import (
     Lists,
     Visible,
     check_pairs,
-    count_repeated,
     like,
     list_rows,
     list_tiles,
@@ -33,28 +32,23 @@ Layers = TypeVar("Layers")
 
 @dataclass(frozen=True)
 class Projection:
-    """A scene projected to the screen of one view, and the running sum over what each program counted (rows.py)."""
-
-    table: Float[Tensor, " numbers"]
-    records: Float[Tensor, "n 12"]
-    tile_counts: Int[Tensor, " n"]
-    radii: Float[Tensor, " n"]
-    sums: Int[Tensor, " b"]
-    gated: bool
-    """Whether records hold gates."""
-
-
-@dataclass(frozen=True)
-class Screen:
     """A scene projected to the screen of one view."""
 
     table: Float[Tensor, " numbers"]
     records: Float[Tensor, "n 12"]
     tile_counts: Int[Tensor, " n"]
     radii: Float[Tensor, " n"]
-    lists: Lists
+    sums: Int[Tensor, " b"]
+    """The running sum over what each program counted."""
     gated: bool
     """Whether records hold gates."""
+
+
+@dataclass(frozen=True)
+class Screen(Projection):
+    """A projected scene with the tiles' lists."""
+
+    lists: Lists
 
 
 def project(gaussians: Gaussians, view: KernelView) -> Screen:
@@ -77,7 +71,7 @@ def draw(
     place = like(rows, view, projection.records.device)
     room = predicted(place, rows, PAIR_LIMIT)
     if room is not None:
-        visible = list_visible_rows(projection, room, view)
+        visible = list_rows(projection.records, projection.tile_counts, projection.sums, room, view)
         counted = copy_to_host(visible.sizes.on_device)
         screen = list_in(room, projection, visible, view)
         layers = work(screen)
@@ -85,7 +79,6 @@ def draw(
         if room.holds(visible.sizes.pairs, visible.sizes.rows):
             remember(place, visible.sizes.rows, visible.sizes.pairs)
             return screen, layers
-        count_repeated()
         del screen, layers
     screen = list_exactly(gaussians, projection, view)
     remember(place, screen.lists.sizes.rows, screen.lists.sizes.pairs)
@@ -116,19 +109,15 @@ def project_all(gaussians: Gaussians, view: KernelView, gates: Float[Tensor, " n
 
 def list_exactly(gaussians: Gaussians, projection: Projection, view: KernelView) -> Screen:
     """Lists what is visible, in no more room than that takes: waits for its size."""
-    visible = list_visible_rows(projection, Room(len(gaussians), PAIR_LIMIT), view)
+    room = Room(len(gaussians), PAIR_LIMIT)
+    visible = list_rows(projection.records, projection.tile_counts, projection.sums, room, view)
     sizes = visible.sizes
     read(sizes, copy_to_host(sizes.on_device), gaussians, projection)
     return list_in(Room(sizes.rows, sizes.pairs), projection, visible, view)
 
 
-def list_visible_rows(projection: Projection, room: Room, view: KernelView) -> Visible:
-    return list_rows(projection.records, projection.tile_counts, projection.sums, room, view)
-
-
 def list_in(room: Room, projection: Projection, visible: Visible, view: KernelView) -> Screen:
-    p = projection
-    return Screen(p.table, p.records, p.tile_counts, p.radii, list_tiles(p.records, visible, room, view), p.gated)
+    return Screen(**vars(projection), lists=list_tiles(projection.records, visible, room, view))
 
 
 def wait_for(numbers: HostCopy) -> list[int]:

@@ -25,3 +25,13 @@ def split_by(rule: Rule) -> Iterator[None]:
         for name, value in vars(rule).items():
             patch.setattr(parts, name.upper(), value)
         yield
+
+
+def part_length(pairs: int) -> int:
+    """Least number of pairs of a part, for a view with ``pairs``."""
+    return max(parts.MIN_PART_PAIRS, -(-pairs // parts.MAX_PARTS))
+
+
+def split_length(pairs: int) -> int:
+    """Least number of pairs of a tile that is split, for a view with ``pairs``."""
+    return parts.MIN_PARTS * part_length(pairs)

@@ -1,6 +1,7 @@
 """Room for the lists is guessed: any room that is large enough gives the same bits, and a small one a second try."""
 
 import dataclasses
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -36,17 +37,18 @@ def scene() -> Gaussians:
     return Gaussians.concatenate([behind, random_gaussians(3, VIEW, terms=1), giant])
 
 
-def drawn(room: Room | None) -> dict[str, torch.Tensor]:
-    """Images and gradients with that guess, in short parts."""
-    with pytest.MonkeyPatch.context() as patch, split_by(Rule(min_part_pairs=2, min_parts=2)):
-        patch.setattr(screen, "predicted", lambda *_: room)
+def drawn(room: Room | None, waits: int) -> dict[str, torch.Tensor]:
+    """Images and gradients with that guess, in short parts; ``waits``: how often lists wait for their exact size."""
+    exactly, guess = patch.object(screen, "list_exactly", wraps=screen.list_exactly), lambda *_: room
+    with exactly as called, patch.object(screen, "predicted", guess), split_by(Rule(min_part_pairs=2, min_parts=2)):
         result = render(scene(), VIEW, "triton", torch.float32)
+    assert called.call_count == waits
     return result.images | result.gradients
 
 
 @pytest.fixture(scope="module")
 def exact() -> dict[str, torch.Tensor]:
-    return drawn(None)
+    return drawn(None, waits=1)
 
 
 @pytest.fixture(scope="module")
@@ -65,9 +67,7 @@ def assert_same_bits(found: dict[str, torch.Tensor], exact: dict[str, torch.Tens
 @pytest.mark.parametrize("more", first_interpreted([3, 9], [0, 0], [1, 0], [0, 1], [400, 2000]))
 def test_any_room_that_is_large_enough_gives_the_same_bits(more, exact, taken, monkeypatch):
     fill_buffers_with_nan(monkeypatch)
-    before = lists.repeated_forwards()
-    assert_same_bits(drawn(Room(taken.rows + more[0], taken.pairs + more[1])), exact)
-    assert lists.repeated_forwards() == before
+    assert_same_bits(drawn(Room(taken.rows + more[0], taken.pairs + more[1]), waits=0), exact)
 
 
 @pytest.mark.lengthy
@@ -77,9 +77,7 @@ def test_a_view_that_does_not_fit_is_drawn_again(short, exact, taken, monkeypatc
     room = {"both": Room(1, 1), "rows": Room(taken.rows - 1, taken.pairs), "pairs": Room(taken.rows, taken.pairs - 1)}[
         short
     ]
-    before = lists.repeated_forwards()
-    assert_same_bits(drawn(room), exact)
-    assert lists.repeated_forwards() == before + 1
+    assert_same_bits(drawn(room, waits=1), exact)
 
 
 @pytest.mark.parametrize(("rows", "pairs", "fits"), [(0, 0, True), (-1, 9, False), (9, -1, False)])
@@ -88,7 +86,7 @@ def test_what_does_not_fit_is_listed_as_nothing(rows, pairs, fits, taken, monkey
     view = KernelView(VIEW, SplatSettings())
     projection = screen.project_all(cast(scene(), torch.float32, device=DEVICE), view)
     room = Room(taken.rows + rows, taken.pairs + pairs)
-    visible = screen.list_visible_rows(projection, room, view)
+    visible = lists.list_rows(projection.records, projection.tile_counts, projection.sums, room, view)
     # All pairs, visible rows, bad rows; listed pairs, listed rows.
     listed = [taken.pairs, taken.rows] if fits else [0, 0]
     assert visible.sizes.on_device.tolist() == [taken.pairs, taken.rows, 0, *listed]

@@ -9,7 +9,7 @@ from torch import Tensor
 from sparsestreet.ops import splat
 from sparsestreet.ops.raster import Raster
 from sparsestreet.ops.splat import _compose
-from sparsestreet.ops.triton.pixels import Composed, compose, decompose
+from sparsestreet.ops.triton.pixels import compose, decompose
 from tests.ops.scenes import camera, cast, device_of, random_gaussians
 
 DEVICE = device_of("triton")
@@ -44,12 +44,12 @@ def test_against_torch(behind, asked):
     )
 
     colors, light, depth = (value.detach().clone() for value in layers[:3])
-    alpha = compose(colors, light, depth, None if behind_it is None else behind_it.detach())
+    no_graph = None if behind_it is None else behind_it.detach()
+    alpha = compose(colors, light, depth, no_graph)
     for ours, theirs in zip((colors, alpha, depth), images, strict=True):
         assert torch.equal(ours, theirs)
-    composed = Composed(light, depth, None if behind_it is None else behind_it.detach())
     v_rgb = torch.zeros_like(rgb) if given[0] is None else given[0]
-    found = decompose(composed, v_rgb, given[1], given[2], background_too=bool(background))
+    found = decompose(light, depth, no_graph, v_rgb, given[1], given[2], background_too=bool(background))
     for ours, theirs in zip(found, (*expected, None), strict=False):
         if theirs is None:
             assert ours is None or not ours.any()

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from sparsestreet.ops.activate import activate
 from sparsestreet.ops.adam import AdamStep, adam_rows_, adam_step_
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.sky import over_sky
@@ -17,9 +18,8 @@ from sparsestreet.ops.triton import ssim as fused_ssim
 from tests.ops.scenes import camera, device_of
 from tests.ops.test_activate import case
 from tests.ops.test_activate import values_and_gradients as activated
-from tests.ops.test_poses import MAX_GAP
+from tests.ops.test_poses import MAX_GAP, on_device
 from tests.ops.triton.recording import Launch, compile_launches, record_launches
-from tests.ops.triton.test_poses import on_device
 
 pytestmark = pytest.mark.slow
 DEVICE = device_of("triton")
@@ -59,10 +59,10 @@ def compiled(request) -> list[tuple[Launch, dict]]:
 
 
 def launch_nodes() -> None:
-    for rest, degree, masked, placed in ((15, 3, True, True), (0, 0, False, False)):
-        inputs, run = case(rest, degree, masked, placed, torch.float32, count=2, device=DEVICE)
-        activated(inputs, lambda run=run: run("triton"))
-    table, deltas = on_device(0.3)
+    for rest, degree, every in ((15, 3, True), (0, 0, False)):
+        rows = case(rest, every, every, 2, torch.float32, DEVICE)
+        activated(rows, lambda parts, degree=degree: activate(parts, sh_degree=degree, backend="triton"))
+    table, deltas = on_device("triton", torch.float32)
     poses_at(table, *deltas, 0.3, MAX_GAP, backend="triton").translations.sum().backward()
 
 

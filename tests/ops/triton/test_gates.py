@@ -10,7 +10,6 @@ from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.types import Camera, Gaussians
 from tests.ops.scenes import (
     BACKENDS,
-    FIELDS,
     camera,
     cast,
     device_of,
@@ -101,42 +100,6 @@ def test_rows_that_move(poisoned):
     """The bars of the op in float32, as in test_parity.py."""
     gaussians, gates, view = moving()
     assert_all_say_the_same(gaussians, view, gates, SplatSettings(antialias=True), 1e-5, 1e-4)
-
-
-@pytest.mark.slow_if_interpreted
-@pytest.mark.parametrize("size", [(1, 1), (35, 2), (16, 16)])
-@pytest.mark.parametrize("fractions", [False, True])
-def test_sizes(size, fractions, poisoned):
-    view = camera(*size, focal=20.0)
-    gates = torch.rand(12, generator=torch.Generator().manual_seed(1))
-    gates = (gates if fractions else gates > 0.5).double()
-    assert_all_say_the_same(random_gaussians(12, view, seed=7), view, gates, SplatSettings(), 1e-5, 1e-4)
-
-
-@pytest.mark.parametrize("choices", first_interpreted(Rule(), Rule(min_part_pairs=1)), ids=["whole tiles", "parts"])
-def test_open_gates_change_no_bit(choices, poisoned):
-    """On a device the compiler may contract other products."""
-    gaussians = stack(5, 0.9)
-    with split_by(choices):
-        plain, opened = (
-            gated(gaussians, VIEW, gates, "triton", torch.float32, EXCLUSIVE, BACKGROUND)
-            for gates in (None, torch.ones(6))
-        )
-    for without, given in zip(plain, opened, strict=True):
-        for name, value in without.items():
-            rounding = 0.0 if DEVICE.type == "cpu" else 1e-6 * float(value.abs().max())
-            torch.testing.assert_close(given[name], value, rtol=0.0, atol=rounding, msg=name)
-
-
-@pytest.mark.parametrize("choices", first_interpreted(Rule(), Rule(min_part_pairs=1)), ids=["whole tiles", "parts"])
-def test_closed_gates_show_the_background_and_still_learn(choices, poisoned):
-    gaussians, gates = stack(5, 0.9), torch.zeros(6)
-    with split_by(choices):
-        images, gradients = gated(gaussians, VIEW, gates, "triton", torch.float32, background=BACKGROUND)
-    assert torch.equal(images["rgb"], BACKGROUND.float().double().expand(9, 19, 3))
-    assert not images["alpha"].any()
-    assert all(not gradients[name].any() for name in (*FIELDS, "screen"))
-    assert (gradients["gates"] != 0).all()
 
 
 def test_gates_learn_alone_in_any_layout():

@@ -8,7 +8,6 @@ import torch
 
 from sparsestreet.ops import SplatSettings, contribution, leave_one_out, splat
 from sparsestreet.ops.triton import lists
-from sparsestreet.ops.triton.parts import split_length
 from sparsestreet.ops.triton.screen import Screen, project
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Gaussians, Shutter
@@ -22,7 +21,7 @@ from tests.ops.scenes import (
     random_gaussians,
     render,
 )
-from tests.ops.triton.splitting import Rule, split_by
+from tests.ops.triton.splitting import Rule, split_by, split_length
 
 DEVICE = device_of("triton")
 WIDTH, HEIGHT, TILE = 587, 171, 16

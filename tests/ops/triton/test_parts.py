@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from sparsestreet.ops import SplatSettings, contribution, splat
 from sparsestreet.ops.triton import pixels, rasterizer
-from sparsestreet.ops.triton.parts import part_length, split_length
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
@@ -24,7 +23,7 @@ from tests.ops.scenes import (
     relative_error,
     render,
 )
-from tests.ops.triton.splitting import Rule, split_by
+from tests.ops.triton.splitting import Rule, part_length, split_by, split_length
 from tests.ops.triton.tile_lists import lists_of
 
 DEVICE = device_of("triton")
