@@ -1,6 +1,6 @@
 """Density control: strategies that decide where a node needs more or fewer Gaussians, and return a RowPlan.
 
-``strategy`` is the interface. ``statistics`` accumulates screen gradients and sizes since the last refinement.
+``strategy`` is the interface, and accumulates screen gradients and sizes since the last refinement.
 ``gradient`` is the strategy of 3DGS, ``vibrating`` that of PVG, ``mcmc`` that of 3DGS-MCMC.
 """
 

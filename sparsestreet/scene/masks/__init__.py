@@ -1,8 +1,8 @@
 """Learnable masks that find the Gaussians which a scene can do without.
 
-``mask`` is the interface. ``static`` has one score per Gaussian for all times. ``sampled`` has a probability per
-Gaussian and draws from it in every step. ``temporal`` has a network that gives one score per Gaussian and time.
-``baked`` is its result, a bit per Gaussian and training frame.
+``mask`` is the interface, and the result of a mask over time, a bit per Gaussian and training frame. ``static`` has one
+score per Gaussian for all times. ``sampled`` has a probability per Gaussian and draws from it in every step.
+``temporal`` has a network that gives one score per Gaussian and time.
 """
 
 from sparsestreet.scene.masks.mask import BakedMask, BakedMaskSettings, Mask, MaskScope, MaskSettings
