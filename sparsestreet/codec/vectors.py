@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 from jaxtyping import Float64, Int16, Int64, UInt64
+from scipy.spatial.transform import Rotation
 
 from sparsestreet.codec.arrays import Cursor, packed, unpacked
 
@@ -88,21 +89,9 @@ def _cube_rotations() -> Float64[np.ndarray, "24 4"]:
     return np.array(found)
 
 
-def _axis_orders(quaternions: Float64[np.ndarray, "24 4"]) -> Int64[np.ndarray, "24 3"]:
-    """Returns, for each rotation of a cube, which old axis each new axis lies along."""
-    w, x, y, z = quaternions.T
-    rows = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return np.abs(rows).argmax(0).T
-
-
 _CUBE = _cube_rotations()
-_ORDERS = _axis_orders(_CUBE)
+_ORDERS = np.abs(Rotation.from_quat(_CUBE, scalar_first=True).as_matrix()).argmax(1)
+"""Which old axis each new axis lies along, for each rotation of a cube."""
 
 
 def nearest_turn(

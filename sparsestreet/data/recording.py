@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
-from sparsestreet.data.frame_cache import CacheSize, FrameCache, LruCache, MemoryForecast, cache_bytes
+from sparsestreet.data.frame_cache import CacheSize, FrameCache, MemoryForecast, cache_bytes
 from sparsestreet.data.hood import bottom_rows
 from sparsestreet.data.images import (
     MASK_KINDS,
@@ -278,7 +278,7 @@ class Pixels:
     rig: Sequence[RigCamera[str]]
     recorded_sizes: Sequence[tuple[int, int]]
     """(width, height) that each camera's images have."""
-    given: GivenMasks | None
+    given: GivenMasks
     shipped: Callable[[RecordedImage], Masks] = lambda shot: {}
     """Masks of the data set itself; those that are given replace them kind by kind."""
     said: str = "its calibration is for"
@@ -290,10 +290,8 @@ class Pixels:
         return read_image(path, camera.size, camera.undistortion)
 
     def masks(self, shot: RecordedImage) -> Masks:
-        camera, shipped = self.rig[shot.camera], self.shipped(shot)
-        if self.given is None:
-            return shipped
-        return dict(shipped) | self.given.read(
+        camera = self.rig[shot.camera]
+        return dict(self.shipped(shot)) | self.given.read(
             camera.name,
             shot.stem,
             recorded_size=self.recorded_sizes[shot.camera],
@@ -369,11 +367,6 @@ class RecordedReader(LogReader):
         if recording.sparse_points is not None:
             attempt(problems, recording.sparse_points)
         return list(dict.fromkeys(problems))  # many images may have one mask
-
-    @property
-    def given(self) -> GivenMasks | None:
-        """The masks that somebody made."""
-        return None if self.masks is None else GivenMasks(Path(self.masks))
 
     def pinhole(
         self, name: str, index: int, intrinsics: Float64[Tensor, "3 3"], recorded_size: tuple[int, int]

@@ -351,11 +351,14 @@ def people_of(tracks: Sequence[Track], template: BodyTemplate, held_out: frozens
     shaped = [template.shaped(_body(track).shape, float(track.size[2])) for track in tracks]
     vertices, joints = (torch.stack(parts) for parts in zip(*shaped, strict=True))
     attached, weights = template.influences()
+    still = torch.zeros(vertices.shape[1], 4)
     roots, rotations, places = [], [], []
     for i, track in enumerate(tracks):
         in_box = _filled(track, held_out)
         bones = posed_bones(joints[i].expand(len(in_box), 24, 3), in_box)
-        bodies = torch.stack([_posed(vertices[i], bones, frame, attached, weights) for frame in range(len(in_box))])
+        each = (Bones(*parts) for parts in zip(bones.transforms, bones.quaternions, strict=True))
+        # Vertices relative to the pelvis, along the axes of the annotated box.
+        bodies = torch.stack([skin(vertices[i], still, one, attached, weights)[0] for one in each])
         middle = ((bodies.amax(1) + bodies.amin(1)) / 2).mean(0)
         places.append(bodies.mean(0) - middle)
         box_from_body = torch.eye(4, dtype=torch.float64).repeat(len(in_box), 1, 1)
@@ -403,18 +406,6 @@ def _filled(track: Track, held_out: frozenset[int]) -> Float[Tensor, "f 24 4"]:
     return quat.slerp(rotations[lower], rotations[upper], fraction[:, None].expand(-1, 24))
 
 
-def _posed(
-    vertices: Float[Tensor, "v 3"],
-    bones: Bones,
-    frame: int,
-    attached: Int[Tensor, "v k"],
-    weights: Float[Tensor, "v k"],
-) -> Float[Tensor, "v 3"]:
-    """Return the body's vertices relative to its pelvis, along the axes of its annotated box."""
-    still = torch.zeros(len(vertices), 4)
-    return skin(vertices, still, Bones(bones.transforms[frame], bones.quaternions[frame]), attached, weights)[0]
-
-
 @dataclass(frozen=True)
 class Anatomy:
     """The data that move v vertices of i people, with k keyframes each."""
@@ -426,7 +417,7 @@ class Anatomy:
     weights: Float[Tensor, "v m"]
     joints: Float[Tensor, "i 24 3"]
     """Joints at rest, relative to the pelvis, meters."""
-    keyframes: Float[Tensor, "i k 23 4"]
+    joint_keyframes: Float[Tensor, "i k 23 4"]
     """Rotations of all joints but the pelvis, relative to their parents."""
 
     @staticmethod

@@ -84,6 +84,12 @@ class Rows(nn.Module):
         if len(set(lengths.values())) != 1:
             raise ValueError(f"a table needs columns, all of the same number of rows, got {lengths}")
 
+    @staticmethod
+    def of(columns: Mapping[str, Tensor]) -> "Rows":
+        """Return a table in which columns of floating point are parameters, and others buffers."""
+        learned = {name: column for name, column in columns.items() if column.is_floating_point()}
+        return Rows(learned, {name: column for name, column in columns.items() if name not in learned})
+
     def __len__(self) -> int:
         return next(iter(self.columns().values())).shape[0]
 

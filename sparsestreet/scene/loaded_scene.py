@@ -183,11 +183,7 @@ def check_numbers(scene: SceneGraph) -> None:
 
 
 def _restored(entry: Mapping[str, Any], tensors: dict[str, Tensor]) -> Node:
-    columns = {name: tensors[ROWS + name] for name in entry["columns"]}
-    rows = Rows(
-        {name: column for name, column in columns.items() if column.is_floating_point()},
-        {name: column for name, column in columns.items() if not column.is_floating_point()},
-    )
+    rows = Rows.of({name: tensors[ROWS + name] for name in entry["columns"]})
     terms = tuple(rows.sh_rest.shape[1:])
     if terms not in _HIGHER_HARMONICS:  # others would pass for columns, of which tables of squared size are made
         raise ValueError(f"a row has 0, 3, 8 or 15 x 3 harmonics above the first, got {terms}: write the file again")

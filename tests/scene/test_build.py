@@ -1,6 +1,5 @@
 import logging
 
-import pytest
 import torch
 
 from sparsestreet.scene.build import build_scene
@@ -84,8 +83,3 @@ def test_points_from_images_are_made_once_of_what_training_sees(monkeypatch):
     assert scene.counts() == {"background": 7, "cars": 5000}
     build_scene(log, frames, frozenset({3}), {"cars": CARS}, EffectPlan(()), 0)
     assert len(asked) == 1
-
-
-def test_two_nodes_that_claim_one_track_are_an_error():
-    with pytest.raises(ValueError, match=r"track 'driving' .* can belong to one node only"):
-        build({"background": BACKGROUND, "cars": CARS, "trucks": CARS})

@@ -123,10 +123,3 @@ def test_the_scene_gives_every_parameter_the_rate_of_its_own_node():
     assert rates["nodes.cars.rotation_deltas"] is POSE_RATES["rotation_deltas"]
     assert rates["nodes.road.rows.mask_logits"] is RATES["mask_logits"]
     assert rates["effects.sky.texels"] == LearningRate(0.01)
-
-
-def test_a_node_without_a_rate_is_named():
-    with pytest.raises(
-        ValueError, match=r"'rotation_deltas' has no learning rate: add one to node.cars.learning_rates"
-    ):
-        scene_of(RATES).learning_rates()

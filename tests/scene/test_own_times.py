@@ -19,7 +19,6 @@ from tests.scene.people import walker
 from tests.scene.street import (
     CAR_COLOR,
     NUM_FRAMES,
-    background_settings,
     car_pose,
     pose,
     rigid_settings,
@@ -132,13 +131,6 @@ def test_training_times_are_one_a_frame():
     both = replace(log, frames=as_frames([*second, *log.frames]))
     held_out = frozenset({1})
     assert training_data(both, held_out).times == [frame.time for frame in log.frames if frame.frame_index != 1]
-
-
-def test_points_from_lidar_have_the_time_of_their_sweep():
-    log = own_log()
-    assert [sweep.time for sweep in log.sweeps] != [sweep.time for sweep in street_log().sweeps]
-    seeds = background_settings(lidar=200).seeds(training_data(log), torch.Generator().manual_seed(0))
-    torch.testing.assert_close(seeds.times.unique(), torch.tensor([sweep.time for sweep in log.sweeps]))
 
 
 def test_missing_body_poses_are_interpolated_over_time():

@@ -14,7 +14,6 @@ import sparsestreet
 from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.storage import SCENE_FILE, StoredScene, load_scene, save_scene
-from sparsestreet.types import Frame
 from tests.scene.stored import NAMES, background, cars, pixels, stored, view, with_nodes
 
 TIMES = [0.0, 0.25, 0.37, 1.0]
@@ -41,6 +40,8 @@ def test_the_image_is_the_same_bit_for_bit(tmp_path: Path, sh_degree: int):
         expected = pixels(scene.render(view(time)))
         assert all(map(torch.equal, pixels(loaded.render(view(time))), expected))
         assert expected[1].max() > 0.5
+    assert not loaded.render(view()).rgb.requires_grad
+    assert not any(module.training for module in loaded.scene.modules())
     assert loaded.render(view()).spans == {"road": slice(0, 30), "trees": slice(30, 39), "cars": slice(39, 47)}
 
 
@@ -60,12 +61,6 @@ def test_everything_that_is_said_comes_back(tmp_path: Path):
     state = scene.scene.state_dict()
     assert loaded.scene.state_dict().keys() == state.keys()
     assert all(torch.equal(value, state[name]) for name, value in loaded.scene.state_dict().items())
-
-
-def test_a_loaded_scene_has_no_gradient_and_is_not_in_training(tmp_path: Path):
-    loaded = reopened(tmp_path, stored())
-    assert not loaded.render(view()).rgb.requires_grad
-    assert not any(module.training for module in loaded.scene.modules())
 
 
 def test_a_loaded_scene_can_be_trained_on(tmp_path: Path):
@@ -187,10 +182,3 @@ def test_a_new_process_shows_the_same_from_a_folder_that_was_moved(tmp_path: Pat
     subprocess.run(command, check=True, cwd=tmp_path)
     for time, images in zip(TIMES, torch.load(tmp_path / "images.pt"), strict=True):
         assert all(map(torch.equal, images, pixels(scene.render(view(time)))))
-
-
-def test_a_recorded_frame_is_a_view(tmp_path: Path):
-    loaded = reopened(tmp_path, stored())
-    image = torch.zeros(21, 33, 3, dtype=torch.uint8)
-    frame = Frame(view().camera, view().time, 3, 0, image=image)
-    assert torch.equal(loaded.render(frame).rgb, loaded.render(view()).rgb)

@@ -1,7 +1,8 @@
 """The cameras of a log as ``views.json``."""
 
 import json
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
+from typing import Any
 
 import pytest
 import torch
@@ -25,12 +26,11 @@ def odd_view(frame: int = 3) -> View:
     return View(camera, frame / 7, frame, 2, frame / 9.7, 1_532_402_927_600_000_251 + 99_999_997 * frame)
 
 
-def same(a: View, b: View) -> None:
-    assert (a.time, a.frame_index, a.camera_index) == (b.time, b.frame_index, b.camera_index)
-    assert (a.seconds, a.stamp) == (b.seconds, b.stamp)
-    assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
-    assert torch.equal(a.camera.camera_from_world, b.camera.camera_from_world)
-    assert torch.equal(a.camera.intrinsics, b.camera.intrinsics)
+def said(value: Any) -> Any:
+    """All that a view says, as plain values."""
+    if isinstance(value, torch.Tensor):
+        return value.tolist()
+    return {name: said(part) for name, part in vars(value).items()} if is_dataclass(value) else value
 
 
 def test_views_come_back_bit_for_bit(tmp_path):
@@ -38,19 +38,10 @@ def test_views_come_back_bit_for_bit(tmp_path):
     plain, odd = street_views(), [odd_view(frame) for frame in range(4)]  # the first was taken at 0.0 seconds
     write_views(path, odd, plain, frame_rate=12.5)
     views = read_views(path)
-    for written, read in zip([*odd, *plain], [*views.training, *views.held_out], strict=True):
-        same(written, read)
+    assert [said(view) for view in (*views.training, *views.held_out)] == [said(view) for view in (*odd, *plain)]
     assert views.frame_rate == 12.5
-    assert (views.held_out[0].seconds, views.held_out[0].stamp) == (None, None)
-    assert views.held_out[0].camera.distortion is None
-    assert views.held_out[0].camera.shutter is None
-    for written, read in zip(odd, views.training, strict=True):
-        assert torch.equal(there(written.camera.distortion), there(read.camera.distortion))
-        assert written.camera.exposure == read.camera.exposure
-        assert torch.equal(written.camera.shutter.translation, read.camera.shutter.translation)
-        assert torch.equal(written.camera.shutter.rotation, read.camera.shutter.rotation)
-        for name in ("direction", "seconds", "span"):
-            assert getattr(written.camera.shutter, name) == getattr(read.camera.shutter, name)
+    write_views(path, plain, [])
+    assert read_views(path).frame_rate is None
     assert [entry.name for entry in path.parent.iterdir()] == ["views.json"]
 
 
@@ -71,11 +62,6 @@ def test_a_shutter_without_a_direction_is_of_an_earlier_version_and_read_from_th
     assert there(read_views(path).training[0].camera.shutter).direction == "top"
 
 
-def test_an_unknown_frame_rate_is_none(tmp_path):
-    write_views(tmp_path / "views.json", street_views(), [])
-    assert read_views(tmp_path / "views.json").frame_rate is None
-
-
 def test_pixels_are_not_touched(tmp_path):
     """A frame whose image raises when it is read, as one would that loads it from disk."""
     view = street_views()[0]
@@ -85,7 +71,7 @@ def test_pixels_are_not_touched(tmp_path):
     with pytest.raises(AttributeError):
         _ = frame.image
     write_views(tmp_path / "views.json", [frame], [])
-    same(read_views(tmp_path / "views.json").training[0], view)
+    assert said(read_views(tmp_path / "views.json").training[0]) == said(view)
 
 
 def test_a_view_that_nobody_recorded_is_refused_and_leaves_the_old_file(tmp_path):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
@@ -90,8 +90,9 @@ class AddedObject(Node):
             recorded: the frames that this way starts from, in the world of the scene that gets the object.
             to_source: normalized time of that scene -> that of the scene which has the object.
         """
-        chosen = source.rows.instances == instance
-        super().__init__(source.settings, _only(source.rows, chosen))
+        chosen, table = source.rows.instances == instance, source.rows
+        own = {name: column.detach()[chosen] for name, column in table.columns().items() if name not in table.transient}
+        super().__init__(source.settings, Rows.of(own))
         self.name, self.source, self.instance, self.change = name, source, instance, change
         self.recorded, self.to_source = recorded, to_source
         self.register_buffer("chosen", chosen, persistent=False)
@@ -160,11 +161,3 @@ def _transported(poses: Poses, frames: Float64[np.ndarray, "i 4 4"], wanted: Map
     turned = quat.multiply(quat.from_matrix(moves[:, :3, :3]), quaternions[chosen].double())
     quaternions[chosen] = turned.to(quaternions.dtype)
     return replace(poses, quaternions=quaternions, translations=translations)
-
-
-def _only(rows: Rows, chosen: Bool[Tensor, " n"]) -> Rows:
-    columns = {name: column.detach()[chosen] for name, column in rows.columns().items() if name not in rows.transient}
-    return Rows(
-        {name: column for name, column in columns.items() if column.is_floating_point()},
-        {name: column for name, column in columns.items() if not column.is_floating_point()},
-    )

@@ -5,6 +5,7 @@ log calls for, by name; one that it does not have is not built and costs nothing
 """
 
 from abc import ABC, abstractmethod
+from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
@@ -141,6 +142,17 @@ class EffectSettings(ABC):
         return None
 
 
+@dataclass(frozen=True, kw_only=True)
+class PartlessSettings(EffectSettings):
+    """The plan says what is called for, and the scene gets no effect of it: it is a matter of the log or of nodes."""
+
+    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Effect | None":
+        return None
+
+    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Effect":
+        raise ValueError(f"no scene lists {type(self).__name__} among its effects: write the file again")
+
+
 class Effect(nn.Module, ABC):
     """One effect. It acts on the view before the nodes, on the image behind the splats, or on both.
 
@@ -210,6 +222,19 @@ class LinearizedEffects:
     """None: 1."""
     background: Float[Tensor, "h w 3"] | None
     """None: black."""
+
+
+def neighbors_in_time(times: Sequence[float], time: float) -> tuple[int, int, float]:
+    """Return the places of increasing times around one, and its part of the way between them; beyond the ends one
+    place, twice.
+
+    >>> [neighbors_in_time([0.0, 0.5], time) for time in (-1.0, 0.125, 0.5, 2.0)]
+    [(0, 0, 0.0), (0, 1, 0.25), (0, 1, 1.0), (1, 1, 0.0)]
+    """
+    behind = bisect_left(times, time)
+    before, behind = max(behind - 1, 0), min(behind, len(times) - 1)
+    step = times[behind] - times[before]
+    return before, behind, (time - times[before]) / step if step > 0 else 0.0
 
 
 def linearized(effects: Iterable[Effect], view: View) -> LinearizedEffects:

@@ -15,11 +15,17 @@ from torch import Tensor, nn
 from sparsestreet.evidence.exposure import EV, MIN_INSTANTS, GainErrors, ImageGains, gain_errors, image_gains
 from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.pictures.images import Dots
-from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding, neighbors_in_time
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.state import RenderOptions, SceneState
 from sparsestreet.types import Rendering, View
+
+
+def _check_not_negative(**values: float) -> None:
+    for name, value in values.items():
+        if not value >= 0:
+            raise ValueError(f"{name} must be >= 0, got {value}: 0 leaves it out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,9 +49,7 @@ class ExposureSettings(EffectSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("threshold", "smooth", "level"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}: 0 leaves it out")
+        _check_not_negative(threshold=self.threshold, smooth=self.smooth, level=self.level)
 
     def detect(self, data: TrainingData) -> Finding:
         gains = _measured(data)
@@ -112,21 +116,10 @@ class Exposure(Effect):
         """g of a view."""
         if view.camera_index not in self.times:
             return self.log_gains.new_zeros(3)
-        return self._on_line(view.camera_index, view.time, *self._around(view.camera_index, view.time))
+        return self._on_line(view.camera_index, *neighbors_in_time(self.times[view.camera_index], view.time))
 
-    def _around(self, camera: int, time: float) -> tuple[int, int]:
-        """Numbers of the camera's training images at or before and at or behind a time; the same beyond the ends."""
-        own = self.times[camera]
-        behind = bisect_left(own, time)
-        if behind == len(own):
-            return behind - 1, behind - 1
-        return (behind, behind) if behind == 0 or own[behind] == time else (behind - 1, behind)
-
-    def _on_line(self, camera: int, time: float, before: int, behind: int) -> Float[Tensor, "3"]:
-        own, first = self.times[camera], self._first[camera]
-        if before == behind:
-            return self.log_gains[first + before]
-        part = (time - own[before]) / (own[behind] - own[before])
+    def _on_line(self, camera: int, before: int, behind: int, part: float) -> Float[Tensor, "3"]:
+        first = self._first[camera]
         return torch.lerp(self.log_gains[first + before], self.log_gains[first + behind], part)
 
     def image(
@@ -149,7 +142,8 @@ class Exposure(Effect):
             own = self.times[camera]
             place = bisect_left(own, view.time)
             if 0 < place < len(own) - 1 and own[place] == view.time:
-                line = self._on_line(camera, view.time, place - 1, place + 1)
+                part = (view.time - own[place - 1]) / (own[place + 1] - own[place - 1])
+                line = self._on_line(camera, place - 1, place + 1, part)
                 off = self.log_gains[self._first[camera] + place] - line
                 terms["smooth"] = self.settings.smooth * off.square().sum()
         return terms
@@ -225,9 +219,7 @@ class AffineSettings(EffectSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("weight", "decay"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name} must be >= 0, got {getattr(self, name)}: 0 leaves the term out")
+        _check_not_negative(weight=self.weight, decay=self.decay)
 
     def detect(self, data: TrainingData) -> Finding:
         return Finding(called_for=False, reason="one map of colors for all images is nothing that a log calls for")

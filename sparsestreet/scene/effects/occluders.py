@@ -1,29 +1,13 @@
 """What hides the street from a camera and moves with it: the recording car's hood, and dirt on the lens."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
-
-import torch
-from torch import Tensor
 
 from sparsestreet.data.hood import MIN_DRIVE
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.pictures.images import Marked
-from sparsestreet.scene.effects.effect import Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Finding, PartlessSettings
 from sparsestreet.scene.initialize.training_data import TrainingData
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReportedSettings(EffectSettings):
-    """The plan reports what is called for, and nothing is built for it."""
-
-    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> None:
-        return None
-
-    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Effect:
-        raise ValueError(f"no scene file holds what is only reported ({type(self).__name__}): train the scene again")
 
 
 def _unknown(log: DrivingLog, min_share: float, what: str) -> Finding:
@@ -38,7 +22,7 @@ def _unknown(log: DrivingLog, min_share: float, what: str) -> Finding:
 
 
 @dataclass(frozen=True, kw_only=True)
-class HoodSettings(EffectSettings):
+class HoodSettings(PartlessSettings):
     """Called for where rows at the bottom of a camera's images never change.
 
     The log's frames have its pixels in ``Frame.ego`` then (``StreetData``), which losses, seeds, depth and metrics
@@ -68,12 +52,6 @@ class HoodSettings(EffectSettings):
             missing=None if largest.share > 0 else "give masks of the car (data.log.masks), if the images show it",
         )
 
-    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> None:
-        return None
-
-    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Effect:
-        raise ValueError("a scene file holds no hood: it is a matter of the log; train the scene again")
-
 
 def _shown(data: TrainingData) -> list[Marked]:
     """An image of each camera that moved, with what is found of the car."""
@@ -86,7 +64,7 @@ def _shown(data: TrainingData) -> list[Marked]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class DirtSettings(ReportedSettings):
+class DirtSettings(PartlessSettings):
     """Called for where dark spots stay in a camera's images while the street passes.
 
     The log's frames have them in ``Frame.ego`` then (``StreetData``); the scene has no part of it.

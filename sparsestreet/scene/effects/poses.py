@@ -1,7 +1,6 @@
 """Corrections of the poses of cameras and boxes, trained with the scene."""
 
 import math
-from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +16,7 @@ from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.boxes import displacement, without_frames
 from sparsestreet.geometry.cameras import exact_position, inverse
 from sparsestreet.geometry.trajectories import Trajectories, smoothed
-from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding
+from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding, PartlessSettings, neighbors_in_time
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import LearningRate, Rates
 from sparsestreet.scene.nodes.node import Node
@@ -85,10 +84,8 @@ class RecordedPoses:
         places = self._by_camera.get(-1 if view.camera_index is None else view.camera_index)
         if not places:
             return None
-        behind = bisect_left([self.times[place] for place in places], view.time)
-        low, high = places[max(behind - 1, 0)], places[min(behind, len(places) - 1)]
-        step = self.times[high] - self.times[low]
-        return low, high, (view.time - self.times[low]) / step if step > 0 else 0.0
+        low, high, part = neighbors_in_time([self.times[place] for place in places], view.time)
+        return places[low], places[high], part
 
     def _beside(self, camera_from_world: Float[Tensor, "4 4"], around: Neighbors) -> Float64[Tensor, "6"]:
         """The motion from a recorded pose to that on the line between two others; 0 where there is no line."""
@@ -361,7 +358,7 @@ def _torque(products: Float[Tensor, "4 4"]) -> Float[Tensor, "3"]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BoxPosesSettings(EffectSettings):
+class BoxPosesSettings(PartlessSettings):
     """Called for where boxes of moving objects tremble. The rates of the corrections are those of the nodes.
 
     Raises ValueError for a negative threshold.
@@ -401,11 +398,3 @@ class BoxPosesSettings(EffectSettings):
                 node.fix_boxes()
             elif isinstance(node, Tracked) and self.smooth:
                 node.smooth_boxes()
-
-    def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> Effect | None:
-        return None
-
-    def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> Effect:
-        raise ValueError(
-            "box poses are parts of nodes, and no scene lists them among its effects: write the file again"
-        )

@@ -32,16 +32,13 @@ class Points:
     def __len__(self) -> int:
         return self.positions.shape[0]
 
-    def where(self, mask: Bool[Tensor, " n"]) -> "Points":
-        return Points(self.positions[mask], self.colors[mask])
-
-    def at(self, rows: Int[Tensor, " k"]) -> "Points":
-        """Return the points of some rows, in that order."""
+    def where(self, rows: Bool[Tensor, " n"] | Int[Tensor, " k"]) -> "Points":
+        """Return the points that a mask tells, or those of some rows, in that order."""
         return Points(self.positions[rows], self.colors[rows])
 
     def sampled(self, limit: int, generator: torch.Generator) -> "Points":
         """Return at most ``limit`` of the points, drawn without replacement."""
-        return self.at(at_most(limit, torch.arange(len(self)), generator))
+        return self.where(at_most(limit, torch.arange(len(self)), generator))
 
     @staticmethod
     def concatenate(parts: Sequence["Points"]) -> "Points":

@@ -15,7 +15,7 @@ from sparsestreet.geometry.cameras import project
 from sparsestreet.scene.initialize.gaussians import MINIMUM_SCALE, Points, at_most, fit_planes, outside_boxes, thinned
 from sparsestreet.scene.initialize.training_data import Coverage, TrainingData, beyond_lidar
 from sparsestreet.triangulation import TriangulatedPoints
-from sparsestreet.types import Frame, View
+from sparsestreet.types import Frame, Track, View
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class Guesses(PointSource):
             points = random_points(self.positions, count, center, data.log.radius, data.frames, generator)
         if self.largest_scale is None:
             return self.seeds(points)
-        limit = self.largest_scale * _camera_distances(points.positions, data.views)
+        limit = self.largest_scale * _nearest_camera(points.positions, data.views)[0]
         return self.seeds(points, largest=limit.clamp(min=MINIMUM_SCALE))
 
     @abstractmethod
@@ -228,11 +228,13 @@ def directions(count: int, generator: torch.Generator) -> Float[Tensor, "n 3"]:
     return torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
 
 
-def _camera_distances(positions: Float[Tensor, "n 3"], views: Sequence[View]) -> Float[Tensor, " n"]:
-    """Return the distance to the nearest camera, meters."""
+def _nearest_camera(
+    positions: Float[Tensor, "n 3"], views: Sequence[View]
+) -> tuple[Float[Tensor, " n"], Int[Tensor, " n"]]:
+    """Return the distance to the nearest camera, meters, and the number of its view."""
     cameras = torch.stack([view.camera.position for view in views]).double().numpy()
-    distances, _ = KDTree(cameras).query(positions.double().numpy())
-    return torch.from_numpy(distances).float()
+    distances, nearest = KDTree(cameras).query(positions.double().numpy())
+    return torch.from_numpy(distances).float(), torch.from_numpy(nearest)
 
 
 FARTHEST_RATIO = 0.02
@@ -291,7 +293,7 @@ class ImagePoints(PointSource):
         if data.image_points is not None:
             found = data.image_points.static
             chosen = self._chosen(found, count, data, generator)
-            points = Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors)).at(chosen)
+            points = _points_of(found).where(chosen)
             pixel = torch.from_numpy(found.pixel_sizes)[chosen]
         if data.log.sparse_points is not None:
             points, pixel = self._with_sparse(points, pixel, count, data, generator)
@@ -304,10 +306,10 @@ class ImagePoints(PointSource):
         assert data.log.sparse_points is not None
         sparse = data.log.sparse_points()
         rows = torch.arange(len(sparse)) if self.voxel is None else thinned(sparse.positions, self.voxel, generator)
-        both = Points.concatenate([points, Points(sparse.positions, sparse.colors).at(rows)])
+        both = Points.concatenate([points, Points(sparse.positions, sparse.colors).where(rows)])
         sizes = torch.cat((pixel, pixel_sizes(sparse.positions[rows], data.views)))
         chosen = at_most(count, torch.arange(len(both)), generator)
-        return both.at(chosen), sizes[chosen]
+        return both.where(chosen), sizes[chosen]
 
     def _chosen(
         self, found: TriangulatedPoints, count: int, data: TrainingData, generator: torch.Generator
@@ -323,12 +325,20 @@ class ImagePoints(PointSource):
         return order[:count]
 
 
+def points_from_images(track: Track, data: TrainingData) -> Points:
+    """Return the triangulated points inside the track's box, in its frame; none if the run makes none."""
+    return Points.concatenate([] if data.image_points is None else [_points_of(data.image_points.in_boxes[track.name])])
+
+
+def _points_of(found: TriangulatedPoints) -> Points:
+    return Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors))
+
+
 def pixel_sizes(positions: Float[Tensor, "n 3"], views: Sequence[View]) -> Float[Tensor, " n"]:
     """Return the sizes of a pixel at some points, meters, as the nearest camera sees them."""
-    cameras = torch.stack([view.camera.position for view in views]).double().numpy()
     focal = torch.tensor([float(view.camera.intrinsics[0, 0]) for view in views])
-    distances, nearest = KDTree(cameras).query(positions.double().numpy())
-    return torch.from_numpy(distances).float() / focal[torch.from_numpy(nearest)]
+    distances, nearest = _nearest_camera(positions, views)
+    return distances / focal[nearest]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -364,7 +374,7 @@ class LidarPoints(PointSource):
         points = Points.concatenate(parts)
         rows = torch.arange(len(points)) if self.voxel is None else thinned(points.positions, self.voxel, generator)
         chosen = at_most(count, rows, generator)
-        taken, normals = points.at(chosen), None
+        taken, normals = points.where(chosen), None
         if self.flat:
             positions, normals = fit_planes(points.positions).onto(taken.positions)
             taken = Points(positions, taken.colors)

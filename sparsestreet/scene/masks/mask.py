@@ -67,6 +67,14 @@ class Mask(nn.Module, ABC):
         """
 
 
+def check_mask(sparsity_weight: float, threshold: float) -> None:
+    """Raise ValueError for a negative weight, or a threshold outside [0, 1)."""
+    if not sparsity_weight >= 0:
+        raise ValueError(f"a mask's sparsity_weight must be >= 0, got {sparsity_weight}")
+    if not 0 <= threshold < 1:
+        raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {threshold}")
+
+
 @dataclass(frozen=True)
 class MaskScope:
     """Where and when the instances of a node are. A node without instances counts as one instance everywhere, always.

@@ -8,8 +8,8 @@ from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
 from sparsestreet.scene.generators import named_seed
-from sparsestreet.scene.masks.mask import Mask, MaskScope
-from sparsestreet.scene.masks.static import COLUMN, lowered_threshold, straight_through
+from sparsestreet.scene.masks.mask import MaskScope, check_mask
+from sparsestreet.scene.masks.static import LogitMask, lowered_threshold, straight_through
 
 _LIKELIER = 0.5
 """A softmax of two picks the first above it."""
@@ -34,8 +34,7 @@ class SampledMaskSettings:
     """Of all samples, together with the step."""
 
     def __post_init__(self) -> None:
-        if not self.sparsity_weight >= 0:
-            raise ValueError(f"a mask's sparsity_weight must be >= 0, got {self.sparsity_weight}")
+        check_mask(self.sparsity_weight, _LIKELIER)
         if not self.temperature > 0 or self.draws < 1:
             raise ValueError(
                 f"a sampled mask needs a temperature > 0 and draws >= 1, got {self.temperature} and {self.draws}"
@@ -46,7 +45,7 @@ class SampledMaskSettings:
         return SampledMask(self, min_gaussians)
 
 
-class SampledMask(Mask):
+class SampledMask(LogitMask):
     """M ~ Bernoulli(sigma(m)), with the logits m as the column ``mask_logits``.
 
     A training step samples M, which gates the alphas of its rows (``splat``). A row with M = 0 changes no pixel, but
@@ -63,21 +62,8 @@ class SampledMask(Mask):
     ([1.0, 0.0], [1.0, 1.0], [True, False])
     """
 
-    columns = (COLUMN,)
-
-    def __init__(self, settings: SampledMaskSettings, min_gaussians: int = 0) -> None:
-        super().__init__()
-        self.settings = settings
-        self.min_gaussians = min_gaussians
-        self.sparsity_weight = settings.sparsity_weight
-        self._step = 0
-
-    def initial_columns(self, num_rows: int) -> dict[str, Tensor]:
-        return {COLUMN: torch.full((num_rows,), self.settings.initial_logit, dtype=torch.float32)}
-
-    def probabilities(self, rows: Rows) -> Float[Tensor, " n"]:
-        """Return sigma(m) as float32."""
-        return torch.sigmoid(rows.mask_logits.float())
+    settings: SampledMaskSettings
+    _step = 0
 
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
         """Return 1: a scene that is not in a training step shows all rows, with their own opacity and scale."""
@@ -101,14 +87,10 @@ class SampledMask(Mask):
     @torch.no_grad()
     def keep(self, rows: Rows) -> Selection:
         """Selects the rows that are sampled in any of n draws; the likeliest of the others fill up to K_min."""
-        probabilities = self.probabilities(rows)
+        probabilities = self.scores(rows)
         # None of n draws has probability (1 - p)^n, so one uniform number stands for all of them.
         never = self._uniform(rows, "draws") < (1 - probabilities) ** self.settings.draws
         return keep_best(probabilities, never, self.min_gaussians)
-
-    def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
-        """Return no mask: the rows that stayed show always."""
-        return None, {}
 
     def _samples(self, rows: Rows) -> tuple[Float[Tensor, " n"], int | Bool[Tensor, ""]]:
         """The samples of the step, and whether K_min added to them."""

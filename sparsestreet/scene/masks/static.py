@@ -1,13 +1,14 @@
 """One learnable keep score per Gaussian, the same at all times (the paper's mask of static and rigid nodes)."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
-from sparsestreet.scene.masks.mask import Mask, MaskScope
+from sparsestreet.scene.masks.mask import Mask, MaskScope, check_mask
 
 COLUMN = "mask_logits"
 
@@ -27,28 +28,20 @@ class StaticMaskSettings:
     visible rows only, lambda is weighed against the image error. Rows that no image shows are then left to pruning."""
 
     def __post_init__(self) -> None:
-        if not self.sparsity_weight >= 0:
-            raise ValueError(f"a mask's sparsity_weight must be >= 0, got {self.sparsity_weight}")
-        if not 0 <= self.threshold < 1:
-            raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
+        check_mask(self.sparsity_weight, self.threshold)
 
     def build(self, min_gaussians: int, scope: MaskScope | None = None) -> "StaticMask":
         """Return the mask; ``scope`` has no effect, because the mask is the same at all times."""
         return StaticMask(self, min_gaussians)
 
 
-class StaticMask(Mask):
-    """sigma(m_k) > epsilon, with the logits m as the column ``mask_logits``.
+class LogitMask(Mask):
+    """A mask with one logit a row, m, for all times; nothing of it remains after training."""
 
-    >>> mask = StaticMaskSettings(sparsity_weight=0.01, threshold=0.5).build(min_gaussians=0)
-    >>> rows = Rows({"mask_logits": torch.tensor([2.0, -2.0])})
-    >>> mask.multipliers(rows, time=0.0).tolist(), mask.keep(rows).removed
-    ([1.0, 0.0], 1)
-    """
-
+    settings: Any
     columns = (COLUMN,)
 
-    def __init__(self, settings: StaticMaskSettings, min_gaussians: int = 0) -> None:
+    def __init__(self, settings: Any, min_gaussians: int = 0) -> None:
         super().__init__()
         self.settings = settings
         self.min_gaussians = min_gaussians
@@ -61,6 +54,22 @@ class StaticMask(Mask):
         """Return sigma(m) as float32, because bfloat16 logits stop moving at -4.0, above the threshold."""
         with torch.autocast(rows.mask_logits.device.type, enabled=False):
             return torch.sigmoid(rows.mask_logits.float())
+
+    def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
+        """Return no mask: M = 1 for all rows that stayed."""
+        return None, {}
+
+
+class StaticMask(LogitMask):
+    """sigma(m_k) > epsilon, with the logits m as the column ``mask_logits``.
+
+    >>> mask = StaticMaskSettings(sparsity_weight=0.01, threshold=0.5).build(min_gaussians=0)
+    >>> rows = Rows({"mask_logits": torch.tensor([2.0, -2.0])})
+    >>> mask.multipliers(rows, time=0.0).tolist(), mask.keep(rows).removed
+    ([1.0, 0.0], 1)
+    """
+
+    settings: StaticMaskSettings
 
     def multipliers(self, rows: Rows, time: float) -> Float[Tensor, " n"]:
         """Return M; if fewer than K_min scores pass the threshold, the highest ones count as passing."""
@@ -75,10 +84,6 @@ class StaticMask(Mask):
         # Compare in the scores' own dtype, as the multipliers do: both must close the same rows.
         scores = self.scores(rows).detach()
         return keep_best(scores, scores <= self.settings.threshold, self.min_gaussians)
-
-    def finish(self, rows: Rows) -> tuple[None, dict[str, Tensor]]:
-        """Return no mask: M = 1 for all rows that stayed."""
-        return None, {}
 
     def _effective_threshold(self, scores: Float[Tensor, " n"]) -> float | Float[Tensor, ""]:
         """Return the threshold, lowered if needed so that K_min (or all) rows pass; ties all pass."""

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from sparsestreet.scene.gaussians import Rows, Selection, keep_best
-from sparsestreet.scene.masks.mask import BITS, BakedMask, Mask, MaskScope, packed
+from sparsestreet.scene.masks.mask import BITS, BakedMask, Mask, MaskScope, check_mask, packed
 from sparsestreet.scene.masks.static import straight_through
 
 FEATURES = "mask_features"
@@ -52,10 +52,7 @@ class TemporalMaskSettings:
     network closes people at most times."""
 
     def __post_init__(self) -> None:
-        if not self.sparsity_weight >= 0:
-            raise ValueError(f"a mask's sparsity_weight must be >= 0, got {self.sparsity_weight}")
-        if not 0 <= self.threshold < 1:
-            raise ValueError(f"a mask's threshold of a sigmoid must lie in [0, 1), got {self.threshold}")
+        check_mask(self.sparsity_weight, self.threshold)
         if min(self.features, self.feature_times, self.width) < 1 or min(self.frames, self.octaves) < 0:
             raise ValueError(
                 "a mask over time needs features, feature_times and width >= 1, frames and octaves >= 0, got "

@@ -1,9 +1,8 @@
-"""The nodes of a scene. Each node class is one module with its settings, its initialization and its interface.
+"""The nodes of a scene, each with its settings, its initialization and its interface (``node``).
 
-``node`` is the interface shared by all. Three classes hold a whole street: ``background`` stands still, Gaussians of
-``vibrating`` swing and fade, and a network deforms those of a field (in ``deformable``). Three classes hold objects and
-move them along their tracks (``tracked``, with the rigid node, which keeps their shape). ``deformable`` changes it with
-a network, and ``smpl`` moves people by their skeletons.
+Three classes hold a whole street: ``Background`` stands still, Gaussians of ``Vibrating`` swing and fade, and a network
+deforms those of ``Field``. Three classes hold objects and move them along their tracks (``Tracked``). ``Rigid`` keeps
+their shape, ``Deformable`` changes it with a network, and ``Smpl`` moves people by their skeletons.
 """
 
 from sparsestreet.scene.nodes.background import Background, BackgroundSettings

@@ -83,23 +83,12 @@ def temporal_smoothness_at(
     >>> temporal_smoothness_at(torch.tensor([[0.0, 0.5, 1.0]]), jerk, whole, time=0.5, distance=1).item()
     2.0
     """
-    count = times.shape[1]
     here = (times - time).abs().masked_fill(~valid, torch.inf)
-    each, middle = torch.arange(len(times), device=times.device), here.argmin(1)
-    before, after = middle - distance, middle + distance
     steps = torch.where(valid[:, 1:], times[:, 1:] - times[:, :-1], torch.inf)
     # Just above a half: a camera may fire in the middle of two boxes.
     near = here.amin(1) < 0.501 * torch.nn.functional.pad(steps, (0, 1), value=torch.inf).amin()
-    whole = near & (before >= 0) & (after < count)
-    before, after = before.clamp(min=0), after.clamp(max=count - 1)
-    # Valid keyframes come first, so the last of three decides.
-    whole = whole & valid[each, after]
-    span = torch.where(whole, times[each, after] - times[each, before], 1.0)
-    fraction = (times[each, middle] - times[each, before]) / span
-    fixed = translations.detach()
-    line = torch.lerp(fixed[each, before], fixed[each, after], fraction[:, None])
-    bends = 2 * (translations[each, middle] - line).abs().mean(-1)
-    return torch.where(whole, bends, 0.0).sum() / whole.sum().clamp(min=1)
+    middle = here.argmin(1)[:, None, None]
+    return _mean_bend(times, translations, valid, middle, torch.full_like(middle, distance), near[:, None, None])
 
 
 def temporal_smoothness(
@@ -116,18 +105,31 @@ def temporal_smoothness(
     >>> temporal_smoothness(torch.tensor([[0.0, 0.5, 1.0]]), steady, torch.ones(1, 3, dtype=torch.bool)).item()
     0.0
     """
-    count, device = times.shape[1], times.device
-    middle, distance = torch.arange(count, device=device)[:, None], torch.arange(1, REACH + 1, device=device)
+    middle = torch.arange(times.shape[1], device=times.device)[None, :, None]
+    distance = torch.arange(1, REACH + 1, device=times.device)[None, None]
+    return _mean_bend(times, translations, valid, middle, distance, torch.ones_like(middle, dtype=torch.bool))
+
+
+def _mean_bend(
+    times: Float[Tensor, "i k"],
+    translations: Float[Tensor, "i k 3"],
+    valid: Bool[Tensor, "i k"],
+    middle: Int[Tensor, "#i m 1"],
+    distance: Int[Tensor, "#i 1 r"],
+    counts: Bool[Tensor, "#i m 1"],
+) -> Float[Tensor, ""]:
+    """Return the mean |t+ + t- - 2 t| over the keyframes that count and have neighbors at these distances."""
+    count, each = times.shape[1], torch.arange(len(times), device=times.device)[:, None, None]
     before, after = middle - distance, middle + distance
-    inside = (before >= 0) & (after < count)
+    inside = counts & (before >= 0) & (after < count)
     before, after = before.clamp(min=0), after.clamp(max=count - 1)
     # Valid keyframes come first, so the last of three decides.
-    whole = inside & valid[:, after]
-    spans = torch.where(whole, times[:, after] - times[:, before], 1.0)
-    fraction = (times[:, :, None] - times[:, before]) / spans
+    whole = inside & valid[each, after]
+    spans = torch.where(whole, times[each, after] - times[each, before], 1.0)
+    fraction = (times[each, middle] - times[each, before]) / spans
     fixed = translations.detach()
-    line = torch.lerp(fixed[:, before], fixed[:, after], fraction[..., None])
-    bends = 2 * (translations[:, :, None] - line).abs().mean(-1)
+    line = torch.lerp(fixed[each, before], fixed[each, after], fraction[..., None])
+    bends = 2 * (translations[each, middle] - line).abs().mean(-1)
     return torch.where(whole, bends, 0.0).sum() / whole.sum().clamp(min=1)
 
 

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -19,12 +19,12 @@ from sparsestreet.ops.raw import Poses, RawGaussians
 from sparsestreet.scene.body import Anatomy, Body, BodyTemplate, BuiltinBody, People, people_of, surface, trained_poses
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import Points, lidar_in_boxes
+from sparsestreet.scene.initialize.sources import points_from_images
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, excess_volume
 from sparsestreet.scene.nodes.tracked import Tracked, TrackedSettings, matrices, stored_keyframes, stored_objects
 from sparsestreet.scene.state import SceneState
-from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Track, View
 
 _log = logging.getLogger(__name__)
@@ -53,7 +53,7 @@ class SmplSettings(TrackedSettings):
     scale_weight: float = 0.05
     """Weight of the mean squared longest axis, square meters."""
     volume_weight: float = 0.0
-    """Weight of ``node.excess_volume`` above ``volume_quantile`` (DriveStudio's scaling_reg); 0: none."""
+    """Weight of ``excess_volume`` above ``volume_quantile`` (DriveStudio's scaling_reg); 0: none."""
     volume_quantile: float = 0.99
     volume_from: float = 0.2
     """Fraction of the run at which that term starts."""
@@ -102,9 +102,7 @@ class SmplSettings(TrackedSettings):
 
     def restore(self, rows: Rows, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Smpl":
         trajectories = stored_keyframes(tensors)
-        anatomy = Anatomy(
-            tensors["vertices"], tensors["attached"], tensors["weights"], tensors["joints"], tensors["joint_keyframes"]
-        )
+        anatomy = Anatomy(**{part.name: tensors[part.name] for part in fields(Anatomy)})
         return Smpl(self, rows, trajectories, tensors["sizes"], anatomy=anatomy, **stored_objects(header))
 
     def _start(
@@ -151,9 +149,7 @@ def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "
     colors = []
     pooled = lidar_in_boxes(without_frames(tracks, data.held_out), data.sweeps)
     for track, returns, vertices in zip(tracks, pooled, places, strict=True):
-        found = None if data.image_points is None else data.image_points.in_boxes[track.name]
-        points = [returns, *([] if found is None else [_measured(found)])]
-        measured = Points.concatenate(points)
+        measured = Points.concatenate([returns, points_from_images(track, data)])
         if len(measured) == 0:
             colors.append(torch.full_like(vertices, 0.5))
             continue
@@ -162,10 +158,6 @@ def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "
         _, nearest = tree.query(vertices.numpy(), k=nearest_first)  # pyright: ignore[reportArgumentType]
         colors.append(measured.colors[torch.from_numpy(nearest)].mean(1))
     return torch.cat(colors)
-
-
-def _measured(found: TriangulatedPoints) -> Points:
-    return Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors))
 
 
 def _from_third_axis(directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
@@ -206,12 +198,9 @@ class Smpl(Tracked):
     ) -> None:
         """Take the arguments of ``Tracked``; rows also have the buffer ``vertex_ids`` [n] int64, template vertices."""
         super().__init__(settings, rows, keyframes, sizes, names=names, classes=classes, max_gap=max_gap, mask=mask)
-        self.register_buffer("vertices", anatomy.vertices)
-        self.register_buffer("attached", anatomy.attached)
-        self.register_buffer("weights", anatomy.weights)
-        self.register_buffer("joints", anatomy.joints)
-        self.register_buffer("joint_keyframes", anatomy.keyframes)
-        self.joint_deltas = nn.Parameter(torch.zeros_like(anatomy.keyframes[..., 1:]))
+        for name, values in vars(anatomy).items():
+            self.register_buffer(name, values)
+        self.joint_deltas = nn.Parameter(torch.zeros_like(anatomy.joint_keyframes[..., 1:]))
         # The vertices of the last search, and the rows next to each.
         self._neighbors: tuple[Tensor, Tensor] | None = None
 

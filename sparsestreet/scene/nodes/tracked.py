@@ -19,6 +19,7 @@ from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.gaussians import Points, box_surface_points, lidar_in_boxes, neighbor_scales
+from sparsestreet.scene.initialize.sources import points_from_images
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, usual_track_rates
 from sparsestreet.scene.masks import Mask, MaskScope
@@ -50,7 +51,7 @@ class TrackedSettings(NodeSettings):
     """Frames' worth of time; within its span, an object is present up to this far from a training annotation."""
     learning_rates: Rates = field(default_factory=usual_track_rates)
     temporal_smooth: float = 0.0
-    """Weight of the term that keeps learned tracks smooth (see ``node.temporal_smoothness``); 0: the term is
+    """Weight of the term that keeps learned tracks smooth (see ``temporal_smoothness``); 0: the term is
     not computed."""
     temporal_smooth_of: Literal["all", "frame"] = "all"
     """``all``: the mean over all frames and distances at every step; ``frame``: that of the step's frame and one drawn
@@ -76,7 +77,7 @@ class TrackedSettings(NodeSettings):
             return None
         measured = lidar_in_boxes(without_frames(tracks, data.held_out), data.sweeps)
         objects = [
-            self._object_points(track, Points.concatenate([_from_images(track, data), returns]), generator)
+            self._object_points(track, Points.concatenate([points_from_images(track, data), returns]), generator)
             for track, returns in zip(tracks, measured, strict=True)
         ]
         tracks = [track for track, points in zip(tracks, objects, strict=True) if len(points)]
@@ -123,7 +124,7 @@ class TrackedSettings(NodeSettings):
 
 
 def stored_keyframes(tensors: Mapping[str, Tensor]) -> Trajectories:
-    """Return the annotated poses of a scene file."""
+    """Return the annotated poses among the tensors of a node."""
     return Trajectories(
         tensors["keyframe_times"],
         tensors["keyframe_quaternions"],
@@ -154,14 +155,6 @@ def moved_by_boxes(
     turn = quat.to_matrix(after.quaternions) - quat.to_matrix(before.quaternions)
     shift = after.translations - before.translations
     return (turn[instances] @ means[:, :, None]).squeeze(-1) + shift[instances]
-
-
-def _from_images(track: Track, data: TrainingData) -> Points:
-    """Return the points from images inside the track's box, in its frame."""
-    if data.image_points is None:
-        return Points.concatenate([])
-    found = data.image_points.in_boxes[track.name]
-    return Points(torch.from_numpy(found.positions), torch.from_numpy(found.colors))
 
 
 class Tracked(Node):
@@ -285,13 +278,7 @@ class Tracked(Node):
     @property
     def keyframes(self) -> Trajectories:
         """Return the annotated poses of the training frames, without corrections."""
-        return Trajectories(
-            self.keyframe_times,
-            self.keyframe_quaternions,
-            self.keyframe_translations,
-            self.keyframe_valid,
-            self.spans,
-        )
+        return stored_keyframes(dict(self.named_buffers(recurse=False)))
 
     def instances(self) -> Instances:
         """Return the objects, named like their tracks."""

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.scene.density import DensityStatistics, DensityStrategy, GradientDensity, outside_boxes
+from sparsestreet.scene.density import DensityStatistics, GradientDensity, outside_boxes
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from tests.scene.density.scenes import make_rows, with_statistics
 
@@ -38,10 +38,6 @@ def densified(
         max_gaussians=max_gaussians,
         generator=seeded(seed),
     )
-
-
-def test_it_is_a_density_strategy():
-    assert isinstance(GradientDensity(), DensityStrategy)
 
 
 def rows_of_scales(largest: list[float]) -> Rows:

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from sparsestreet.scene.density import DensityStatistics, DensityStrategy, VibratingDensity
+from sparsestreet.scene.density import DensityStatistics, VibratingDensity
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from tests.scene.density.scenes import make_rows
 
@@ -48,10 +48,6 @@ def densified(
         max_gaussians=maximum,
         generator=torch.Generator().manual_seed(seed),
     )
-
-
-def test_it_is_a_density_strategy():
-    assert isinstance(VibratingDensity(), DensityStrategy)
 
 
 def test_either_gradient_asks_for_more_the_most_urgent_first():

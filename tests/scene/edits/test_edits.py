@@ -306,9 +306,6 @@ def test_a_name_of_megabytes_is_compared_by_its_beginning(scene, monkeypatch):
 def test_wrong_names_are_named(scene):
     with pytest.raises(ValueError, match=r"no object 'tram 13': the nearest names are tram 12"):
         edited(scene, Edits({"tram 13": REMOVED}))
-    with pytest.raises(ValueError, match=r"no object 'xxx.*xxx\.\.\.': the nearest names are ") as told:
-        edited(scene, Edits({"x" * (16 << 20): REMOVED}))  # difflib would take seconds
-    assert len(str(told.value)) < 300
     with pytest.raises(ValueError, match="'new' is made of another object: the scene has no object 'tram 13'"):
         edited(scene, Edits(added={"new": Added("tram 13")}))
     with pytest.raises(ValueError, match="has an object 'tram 12' already"):

@@ -71,8 +71,3 @@ def test_too_few_boxes_are_corrected_as_nothing_says_that_they_are_right():
     assert (found.called_for, found.value) == (True, None)
     none = BoxPosesSettings().detect(training_data(replace(street_log(), tracks=())))
     assert not none.called_for
-
-
-def test_a_negative_threshold_is_an_error():
-    with pytest.raises(ValueError, match="threshold must be >= 0 cm, got -1"):
-        BoxPosesSettings(threshold=-1.0)

@@ -1,8 +1,6 @@
 """Gradients of camera poses against finite differences, and which views a correction reaches."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,12 +15,9 @@ from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.scene.effects import Finding
 from sparsestreet.scene.effects import poses as camera_poses
 from sparsestreet.scene.effects.poses import CameraPoses, CameraPosesSettings, RecordedPoses
-from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import FINISHED
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from sparsestreet.types import Camera, Frame, Gaussians, Shutter, View
-from tests.scene.street import background, camera_at, random_rows, training_data
+from tests.scene.street import camera_at, random_rows, training_data
 
 SETTINGS = CameraPosesSettings(weight=0.01)
 EXPECTED, START = 0.02, 0.01
@@ -232,16 +227,6 @@ def test_the_term_is_that_of_the_image_of_the_step():
     assert unweighted.regularizers(view, FINISHED) == {}
 
 
-def test_corrections_come_back_from_a_file(tmp_path: Path):
-    poses = effect(PLAIN, indices=((0, 0), (2, 0)), times=(0.0, 1.0), dtype=torch.float32)
-    scene = SceneGraph({"road": background(random_rows(9, 0))}, {"poses": poses})
-    save_scene(tmp_path / "scene.safetensors", StoredScene(scene, RenderOptions(), "x", 3))
-    again = load_scene(tmp_path).scene.effects["poses"]
-    for frame in (0, 1, 2):
-        view = View(PLAIN, frame / 2, frame, 0)
-        assert torch.equal(again.view(view, FINISHED).camera.camera_from_world, corrected(poses, view))
-
-
 def test_the_log_calls_for_it_where_images_say_that_poses_are_off(monkeypatch: pytest.MonkeyPatch):
     for value, constant, called_for in ((0.6, 0.1, True), (0.4, 3.0, False)):
         found = PoseNoise(value, 0.1, constant, 9, 50, np.zeros(9), np.zeros((9, 2), np.int64))
@@ -254,12 +239,6 @@ def test_the_log_calls_for_it_where_images_say_that_poses_are_off(monkeypatch: p
     assert (finding.called_for, finding.value, finding.missing) == (False, None, None)
     assert SETTINGS.cost(training_data()).numbers == 6 * 5
     assert len(SETTINGS.build(training_data(), finding, torch.Generator()).translations) == 5
-
-
-@pytest.mark.parametrize("wrong", [{"weight": -1.0}, {"threshold": -1.0}])
-def test_negative_numbers_are_errors(wrong: dict[str, Any]):
-    with pytest.raises(ValueError, match="must be >= 0"):
-        CameraPosesSettings(**wrong)
 
 
 def driven(frames: int, size: float) -> tuple[list[View], torch.Tensor]:

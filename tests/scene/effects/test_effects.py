@@ -4,6 +4,7 @@ import logging
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,9 +14,14 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.effects import (
+    AffineSettings,
+    BoxPosesSettings,
+    CameraPosesSettings,
     Effect,
     EffectSettings,
+    ExposureSettings,
     LensSettings,
+    MotionBlurSettings,
     ShutterSettings,
     Sky,
     SkySettings,
@@ -87,8 +93,8 @@ def gain(*factors: float) -> Gain:
 
 
 @torch.no_grad()
-def picture(scene: SceneGraph, camera=CAMERA, camera_index: int | None = 0) -> torch.Tensor:
-    view = View(camera, 0.5, None, camera_index)
+def picture(scene: SceneGraph, camera=CAMERA, camera_index: int | None = 0, time: float = 0.5) -> torch.Tensor:
+    view = View(camera, time, None, camera_index)
     return render(scene, view, options=RenderOptions(backend="reference")).rgb
 
 
@@ -109,6 +115,7 @@ def test_a_lens_is_simulated_where_it_moves_pixels_far_enough():
     log = log_through(lens=True)
     (fx, _, cx), (_, fy, cy), _ = log.views[0].camera.intrinsics.tolist()
     found = LensSettings().detect(training_data(log))
+    assert (found.called_for, found.unit, found.threshold, found.declared) == (True, "px", 0.5, True)
     corner = math.hypot(cx / fx, cy / fy)
     ray = corner
     for _ in range(100):
@@ -135,18 +142,6 @@ def test_of_several_lenses_the_strongest_decides():
     assert found.reason.startswith("2 of 2 cameras")
 
 
-@pytest.mark.parametrize("least", [-1.0, math.nan])
-def test_a_least_shift_is_a_number(least):
-    with pytest.raises(ValueError, match=r"min_shift must be pixels >= 0, got .*: to leave out lenses say when=off"):
-        LensSettings(min_shift=least)
-
-
-def test_a_finding_has_a_number_and_its_threshold():
-    found = LensSettings().detect(training_data(log_through(lens=True)))
-    assert (found.called_for, found.unit, found.threshold, found.declared) == (True, "px", 0.5, True)
-    assert not ShutterSettings().detect(training_data(log_through(lens=True))).called_for
-
-
 def test_effects_act_in_the_order_of_the_configuration():
     gains = replace(GAIN, when="on")
     assert list(built({"gain": gains, "sky": SkySettings(resolution=2)}, street_log())) == ["gain", "sky"]
@@ -165,18 +160,8 @@ def test_what_the_log_cannot_support_is_an_error_that_says_what_is_missing(name:
         built({name: replace(ALL[name], when="on")}, street_log())
 
 
-def test_on_builds_what_is_not_called_for():
-    assert list(built({"gain": GAIN}, street_log())) == []  # one camera
-    assert list(built({"gain": replace(GAIN, when="on")}, street_log())) == ["gain"]
-
-
-class Undetectable(GainSettings):
-    def detect(self, data):
-        raise AssertionError("what is off is not looked for")
-
-
-def test_off_is_absent_and_nothing_is_measured():
-    off = {"sky": SkySettings(when="off"), "gain": Undetectable(evenness=0.0, when="off")}
+def test_what_is_off_is_absent():
+    off = {"sky": SkySettings(when="off"), "affine": AffineSettings(), "exposure": ExposureSettings(when="off")}
     assert built(off, log_through(lens=True)) == {}
 
 
@@ -214,13 +199,6 @@ def test_what_is_left_out_is_gone_and_the_rest_is_the_same():
         scene.without("fog")
 
 
-def test_other_nodes_are_seen_through_the_same_effects():
-    scene = scene_of(sky=sky(), gain=gain(1.3))
-    other = scene.with_nodes({"trees": background(random_rows(4, 1))})
-    assert other.counts() == {"trees": 4}
-    assert [other.effects[name] is effect for name, effect in scene.effects.items()] == [True, True]
-
-
 class Late(Effect):
     """Shows what is there at the progress of the training."""
 
@@ -248,11 +226,6 @@ def test_an_effect_is_a_phase_of_a_frame_where_it_acts_on_the_image():
     assert recorder.stop().keys() == {"rest", "scene", "splat", "sky", "gain"}
 
 
-def test_a_word_that_says_nothing_is_an_error():
-    with pytest.raises(ValueError, match=r"when must be auto, on or off, got 'maybe'"):
-        replace(GAIN, when="maybe")
-
-
 def test_a_novel_view_has_no_camera_of_the_log():
     scene, plain = scene_of(gain=gain(1.2, 0.9)), picture(scene_of())
     torch.testing.assert_close(picture(scene, camera_index=1), 0.9 * plain)
@@ -277,13 +250,32 @@ def test_terms_rates_and_bytes_of_effects_stand_beside_those_of_nodes():
 
 def test_effects_come_back_from_a_file_in_their_order(tmp_path: Path):
     scene = scene_of(gain=gain(1.2, 0.9), sky=sky(), lens=Pinhole(LensSettings(when="off")))
-    save_scene(tmp_path / "scene.safetensors", StoredScene(scene, RenderOptions(), "x", 5))
-    again = load_scene(tmp_path).scene
-    assert list(again.effects) == ["gain", "sky", "lens"]
-    assert again.effects["gain"].settings == GAIN
-    assert torch.equal(picture(again, BENT, 1), picture(scene, BENT, 1))
-    # Left out of a scene that is then stored, a lens stays left out.
     lens = scene_of(lens=LensSettings().restore({}, {}))
-    for saved, camera in ((lens, BENT), (lens.without("lens"), CAMERA)):
+    # Left out of a scene that is then stored, a lens stays left out.
+    for saved in (scene, lens, lens.without("lens")):
         save_scene(tmp_path / "scene.safetensors", StoredScene(saved, RenderOptions(), "x", 5))
-        assert torch.equal(picture(load_scene(tmp_path).scene, BENT), picture(scene_of(), camera))
+        again = load_scene(tmp_path).scene
+        assert list(again.effects) == list(saved.effects)
+        assert torch.equal(picture(again, BENT, 1), picture(saved, BENT, 1))
+    assert torch.equal(picture(again, BENT), picture(scene_of()))
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "said"),
+    [
+        (GainSettings, {"evenness": 0.5, "when": "maybe"}, r"when must be auto, on or off, got 'maybe'"),
+        (SkySettings, {"resolution": 0}, "at least one texel"),
+        (LensSettings, {"min_shift": -1.0}, "min_shift must be pixels >= 0, got .*: to leave out lenses say when=off"),
+        (LensSettings, {"min_shift": math.nan}, "min_shift must be pixels >= 0"),
+        (MotionBlurSettings, {"min_blur": 0.0}, r"min_blur must be pixels > 0, got .*when=on"),
+        (MotionBlurSettings, {"min_blur": math.nan}, "min_blur must be pixels > 0"),
+        (ExposureSettings, {"smooth": -1.0}, "smooth must be >= 0, got -1"),
+        (AffineSettings, {"weight": -1.0}, r"weight must be >= 0, got -1\.0"),
+        (CameraPosesSettings, {"weight": -1.0}, r"must be >= 0, got -1\.0 and 0\.5"),
+        (CameraPosesSettings, {"threshold": -1.0}, r"must be >= 0, got 0\.0005 and -1\.0"),
+        (BoxPosesSettings, {"threshold": -1.0}, "threshold must be >= 0 cm, got -1"),
+    ],
+)
+def test_settings_that_cannot_be(kind: type[EffectSettings], changes: dict[str, Any], said: str):
+    with pytest.raises(ValueError, match=said):
+        kind(**changes)

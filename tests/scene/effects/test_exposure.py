@@ -8,19 +8,15 @@ import torch
 
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
-from sparsestreet.scene.effects import Exposure, ExposureSettings, Finding, Sky, SkySettings, linearized
+from sparsestreet.scene.effects import Exposure, ExposureSettings, Finding, linearized
 from sparsestreet.scene.effects import exposure as exposure_module
-from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.state import FINISHED
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from sparsestreet.types import Sweep, Track, View
 from tests.evidence import wall
-from tests.scene.effects.test_effects import built
-from tests.scene.street import background, camera_at, random_rows, training_data
+from tests.scene.effects.test_effects import CAMERA, picture, scene_of, sky
+from tests.scene.street import training_data
 
-CAMERA = camera_at(-6.0, width=17, height=11)
 TIMES = {0: [0.0, 0.25, 1.0], 2: [0.1, 0.6]}
 SETTINGS = ExposureSettings(when="on")
 FOUND = Finding(called_for=True, reason="")
@@ -36,22 +32,6 @@ def exposure(**said) -> Exposure:
 
 def view(time: float, camera: int | None) -> View:
     return View(CAMERA, time, None, camera)
-
-
-def scene_of(**effects) -> SceneGraph:
-    return SceneGraph({"road": background(random_rows(9, 0))}, effects)
-
-
-@torch.no_grad()
-def picture(scene: SceneGraph, seen: View) -> torch.Tensor:
-    return render(scene, seen, options=RenderOptions(backend="reference")).rgb
-
-
-def sky() -> Sky:
-    made = Sky(SkySettings(resolution=4))
-    with torch.no_grad():
-        made.texels.uniform_(0, 1, generator=torch.Generator().manual_seed(2))
-    return made
 
 
 @pytest.mark.parametrize(
@@ -71,7 +51,9 @@ def test_a_view_has_the_gain_of_its_image_or_of_the_line_between_neighbors(time,
     made = exposure()
     expected = torch.tensor(wanted) @ made.log_gains
     torch.testing.assert_close(made.log_gain(view(time, camera)), expected)
-    plain, seen = (picture(scene, view(time, camera)) for scene in (scene_of(sky=sky()), scene_of(sky=sky(), g=made)))
+    plain, seen = (
+        picture(scene, camera_index=camera, time=time) for scene in (scene_of(sky=sky()), scene_of(sky=sky(), g=made))
+    )
     torch.testing.assert_close(seen, plain * expected.exp().detach())
 
 
@@ -108,17 +90,7 @@ def test_regularizers_draw_gains_to_their_neighbors_line_and_their_mean_to_zero(
     for seen in (view(0.0, 0), view(0.2, 0), view(0.25, None)):
         assert made.regularizers(seen, FINISHED).keys() == {"level"}
     assert exposure(smooth=0.0, level=0.0).regularizers(view(0.25, 0), FINISHED) == {}
-
-
-def test_it_comes_back_from_a_file(tmp_path):
-    scene = scene_of(sky=sky(), exposure=exposure())
-    save_scene(tmp_path / "scene.safetensors", StoredScene(scene, RenderOptions(), "x", 5))
-    again = load_scene(tmp_path).scene
-    assert again.effects["exposure"].settings == SETTINGS
-    for seen in (view(0.25, 0), view(0.4, 0), view(0.35, 2), view(0.5, None)):
-        assert torch.equal(picture(again, seen), picture(scene, seen))
-    assert scene.bytes_by_part()["exposure"] == 5 * 3 * 4
-    assert torch.equal(picture(again.without("exposure"), view(0.25, 0)), picture(scene_of(sky=sky()), view(0.25, 0)))
+    assert scene_of(exposure=made).bytes_by_part()["exposure"] == 5 * 3 * 4
 
 
 def log_of(planted: torch.Tensor, lidar: bool = True) -> DrivingLog:
@@ -135,15 +107,11 @@ def tinted(size: float) -> torch.Tensor:
     return (size * signs).expand(wall.INSTANTS, 2, 3)
 
 
-def of(log: DrivingLog, held_out: frozenset[int] = frozenset()) -> TrainingData:
-    return training_data(log, held_out)
-
-
 def test_cameras_of_other_colors_call_for_gains():
     """Half of the points' images are those of the other camera, so half of the difference is the error."""
     wanted = 0.1 / math.log(2)
     for size, on in ((0.0, False), (0.02, False), (0.1, True)):
-        found = SETTINGS.detect(of(log_of(tinted(size))))
+        found = SETTINGS.detect(training_data(log_of(tinted(size))))
         assert found.called_for is on
         assert found.value is not None
         assert (found.unit, found.threshold, found.declared, found.missing) == ("EV", 0.05, False, None)
@@ -159,7 +127,7 @@ def test_cameras_of_other_colors_call_for_gains():
 
 
 def test_random_gains_do_not_because_neighbors_do_not_foretell_them():
-    found = SETTINGS.detect(of(log_of(wall.random_gains(0.2))))
+    found = SETTINGS.detect(training_data(log_of(wall.random_gains(0.2))))
     assert not found.called_for
     assert "neighbors in time foretell too little" in found.reason
     assert found.gain is not None
@@ -168,10 +136,10 @@ def test_random_gains_do_not_because_neighbors_do_not_foretell_them():
 
 def test_without_lidar_nothing_is_called_for_and_on_starts_from_none():
     log = log_of(tinted(0.1), lidar=False)
-    found = SETTINGS.detect(of(log))
+    found = SETTINGS.detect(training_data(log))
     assert not found.called_for
     assert "not measured" in found.reason
-    made = SETTINGS.build(of(log), found, torch.Generator())
+    made = SETTINGS.build(training_data(log), found, torch.Generator())
     assert torch.equal(made.log_gains, torch.zeros(2 * wall.INSTANTS, 3))
 
 
@@ -181,7 +149,7 @@ def test_what_lies_in_the_boxes_of_the_log_says_nothing():
     poses[:, 2, 3] = wall.DEPTH
     tram = Track("tram", "Tram", torch.arange(wall.INSTANTS), poses, torch.tensor([60.0, 20.0, 1.0]))
     log = replace(log_of(tinted(0.1)), tracks=(tram,))
-    assert "not measured" in SETTINGS.detect(of(log)).reason
+    assert "not measured" in SETTINGS.detect(training_data(log)).reason
 
 
 def test_boxes_of_held_out_frames_say_nothing():
@@ -192,7 +160,7 @@ def test_boxes_of_held_out_frames_say_nothing():
     tram = Track("tram", "Tram", torch.tensor([4, 5]), poses, torch.tensor([60.0, 20.0, 1.0]), times=times)
     log = log_of(wall.random_gains(0.1))
     with_tram, without = (
-        SETTINGS.build(of(replace(log, tracks=tracks), frozenset({5})), FOUND, torch.Generator()).log_gains
+        SETTINGS.build(training_data(replace(log, tracks=tracks), frozenset({5})), FOUND, torch.Generator()).log_gains
         for tracks in ((tram,), ())
     )
     assert torch.equal(with_tram, without)
@@ -201,7 +169,7 @@ def test_boxes_of_held_out_frames_say_nothing():
 def test_it_starts_from_the_measured_gains_of_training_images_alone():
     planted = wall.random_gains(0.1)
     held_out = frozenset({3, 8})
-    data = of(log_of(planted), held_out)
+    data = training_data(log_of(planted), held_out)
     made = SETTINGS.build(data, SETTINGS.detect(data), torch.Generator())
     trained = torch.tensor([instant for instant in range(wall.INSTANTS) if instant not in held_out])
     wanted = planted[trained].transpose(0, 1).reshape(-1, 3)
@@ -228,19 +196,10 @@ def test_held_out_images_are_not_looked_at():
         return wall.sweep(index)
 
     sweeps = Sweeps(range(wall.INSTANTS), sweep)
-    data = of(replace(log, frames=lazy, sweeps=sweeps), frozenset({5}))
+    data = training_data(replace(log, frames=lazy, sweeps=sweeps), frozenset({5}))
     SETTINGS.build(data, SETTINGS.detect(data), torch.Generator())
 
 
 def test_times_increase_whatever_the_order_of_the_views():
     seen = [View(CAMERA, time, frame, camera) for camera in (2, 0) for frame, time in ((0, 0.5), (1, 0.1), (2, 0.3))]
     assert exposure_module._times(seen) == {0: [0.1, 0.3, 0.5], 2: [0.1, 0.3, 0.5]}
-
-
-def test_off_is_not_built():
-    assert built({"exposure": ExposureSettings(when="off")}, log_of(tinted(0.1))) == {}
-
-
-def test_a_negative_weight_is_an_error():
-    with pytest.raises(ValueError, match="smooth must be >= 0, got -1"):
-        replace(SETTINGS, smooth=-1.0)

@@ -14,7 +14,6 @@ from sparsestreet.scene.effects.optics import moments_of, num_moments
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import GatheredSplats, light_of, render, stored_of
 from sparsestreet.scene.state import RenderOptions, SceneState
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from sparsestreet.types import Shutter, View
 from tests.scene.street import (
     background,
@@ -190,23 +189,6 @@ def test_held_out_images_are_blurred_too():
     settings = MotionBlurSettings(when="on")
     made = settings.build(data, settings.detect(data), torch.Generator())
     assert set(made.motions) == {(frame, 0) for frame in range(5)}
-
-
-def test_a_stored_scene_is_blurred_as_before(tmp_path):
-    scene = street(blur=blur(2))
-    save_scene(tmp_path / "scene.safetensors", StoredScene(scene, OPTIONS, "street", 5))
-    again = load_scene(tmp_path / "scene.safetensors").scene
-    assert again.effects["blur"].num_moments == 2
-    with torch.no_grad():
-        assert torch.equal(render(scene, VIEW, options=OPTIONS).rgb, render(again, VIEW, options=OPTIONS).rgb)
-        sharp = render(again.without("blur"), VIEW, options=OPTIONS).rgb
-    assert torch.equal(sharp, render(street(), VIEW, options=OPTIONS).rgb)
-
-
-@pytest.mark.parametrize("least", [0.0, -1.0, float("nan")])
-def test_a_least_blur_is_positive(least):
-    with pytest.raises(ValueError, match=r"min_blur must be pixels > 0, got .*when=on"):
-        MotionBlurSettings(when="auto", min_blur=least)
 
 
 def test_a_moment_more_is_a_frame_more():

@@ -1,6 +1,5 @@
 import pytest
 import torch
-from torch.nn.functional import normalize
 
 from sparsestreet.scene.effects import Sky, SkySettings
 
@@ -79,46 +78,3 @@ def test_all_faces_agree_at_a_corner_of_the_cube(side: int):
     for corner in torch.cartesian_prod(*[torch.tensor([-1.0, 1.0]).double()] * 3):
         colors = sky.colors((1 + 1e-9 * torch.eye(3).double()) * corner)  # one direction on each of the three faces
         assert (colors - colors[0]).abs().max() < 1e-7  # slope of at most 8 texels a unit, times 1e-9, rounded up
-
-
-def test_near_a_corner_the_jump_is_less_than_a_texel():
-    """A smooth map (the direction itself): neighboring directions across a corner differ by less than one texel."""
-    side = 16
-    sky = random_sky(side)
-    with torch.no_grad():
-        sky.texels.copy_(normalize(directions_of(side), dim=-1))
-    generator = torch.Generator().manual_seed(2)
-    corner = normalize(torch.tensor([1.0, -1.0, 1.0]).double(), dim=0)
-    around = corner + 1e-6 * torch.randn(50, 1, 3, generator=generator, dtype=torch.float64)
-    colors = sky.colors(around)
-    assert (colors - corner).norm(dim=-1).max() < 2 / side
-
-
-def test_gradient_of_the_texels():
-    sky = random_sky(3)
-    generator = torch.Generator().manual_seed(3)
-    directions = torch.randn(5, 7, 3, generator=generator, dtype=torch.float64)
-
-    def colors(texels: torch.Tensor) -> torch.Tensor:
-        return torch.func.functional_call(sky, {"texels": texels}, (directions,))
-
-    sky.forward = sky.colors
-    assert torch.autograd.gradcheck(colors, [sky.texels])
-
-
-def test_gradients_go_to_the_texels_only():
-    directions = torch.randn(5, 3, generator=torch.Generator().manual_seed(3), requires_grad=True)
-    sky = random_sky(3)
-    sky.colors(directions).sum().backward()
-    assert directions.grad is None
-    assert (sky.texels.grad != 0).any()
-
-
-def test_the_diagonals_and_an_empty_image():
-    assert torch.isfinite(random_sky(4).colors(torch.tensor([[[1.0, 1.0, 1.0], [-1.0, -1.0, 1.0]]]))).all()
-    assert Sky(SkySettings(resolution=2)).colors(torch.zeros(0, 4, 3)).shape == (0, 4, 3)
-
-
-def test_no_texels_are_an_error():
-    with pytest.raises(ValueError, match="at least one texel"):
-        Sky(SkySettings(resolution=0))

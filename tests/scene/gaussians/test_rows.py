@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from sparsestreet.scene.gaussians import RowPlan, Rows
-from tests.scene.street import background, random_rows, static_mask
+from tests.scene.street import random_rows, static_mask
 
 MASK = static_mask()
 
@@ -105,15 +105,6 @@ def test_all_rows_may_go():
     optimizer.step()
 
 
-def test_the_children_inherit_mask_and_instance():
-    rows, _ = trained()
-    logits, instances = rows.mask_logits.detach().clone(), rows.instances.clone()
-    source = torch.tensor([0, 1, 2, 3, 4, 5, 4, 4])
-    rows.resize(RowPlan(6, source, source != torch.arange(8)))
-    assert torch.equal(rows.mask_logits[6:], logits[[4, 4]])
-    assert torch.equal(rows.instances[6:], instances[[4, 4]])
-
-
 def test_an_unknown_edit_changes_nothing():
     rows, optimizer = trained()
     before = snapshot(rows, optimizer)[0]
@@ -178,12 +169,3 @@ def test_a_dropped_column_leaves_the_optimizer():
     assert "mask_logits" not in rows.columns()
     assert logits not in optimizer.state
     assert all(logits is not parameter for group in optimizer.param_groups for parameter in group["params"])
-
-
-def test_a_checkpoint_brings_its_own_number_of_rows():
-    saved = background(random_rows(9, 3, mask=MASK), MASK)
-    resumed = background(random_rows(2, 4, mask=MASK), MASK)
-    resumed.load_state_dict(saved.state_dict())
-    for name, column in saved.rows.columns().items():
-        assert torch.equal(resumed.rows.columns()[name], column)
-    assert all(parameter.requires_grad for parameter in resumed.parameters())

@@ -5,7 +5,6 @@ from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.initialize.gaussians import init_gaussians, lie_flat, neighbor_scales
-from tests.scene.street import static_mask
 
 
 def seeded(
@@ -21,12 +20,6 @@ def seeded(
         generator=generator,
         mask_columns=mask_columns,
     )
-
-
-def test_mean_distance_to_three_neighbors_by_hand():
-    line = torch.tensor([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0], [7.0, 0, 0], [50.0, 0, 0]])
-    expected = torch.tensor([(1 + 3 + 7) / 3, (1 + 2 + 6) / 3, (2 + 3 + 4) / 3, (4 + 6 + 7) / 3, (43 + 47 + 49) / 3])
-    torch.testing.assert_close(neighbor_scales(line), expected)
 
 
 def test_against_all_distances():
@@ -63,13 +56,6 @@ def test_rows_of_points():
         colors.double(), colors.double(), one, opacities=one, sh_degree=1, generator=torch.Generator()
     )
     assert {column.dtype for column in exact.columns().values()} == {torch.float32}
-
-
-def test_a_mask_brings_its_logits():
-    rows = seeded(torch.rand(3, 3), torch.rand(3, 3), mask_columns=static_mask(initial_logit=2.0).initial_columns(3))
-    assert rows.mask_logits.tolist() == [2.0] * 3
-    assert rows.mask_logits.requires_grad
-    assert rows.transient == {"mask_logits"}
 
 
 @pytest.mark.parametrize("opacity", [0.0, 1.0, -0.1])

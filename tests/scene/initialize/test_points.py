@@ -82,13 +82,6 @@ def test_one_point_of_each_cube_is_left_whichever_it_is():
     assert thinned(torch.zeros(0, 3), 0.5, torch.Generator()).tolist() == []
 
 
-def test_random_points_are_drawn_until_there_are_enough():
-    frames = [frame_at(0)]
-    points = random_points(near_positions, 40, CENTER, 20.0, frames, torch.Generator().manual_seed(0))
-    assert len(points) == 40
-    assert project(frames[0].camera, points.positions)[2].all()
-
-
 def test_random_points_come_from_all_views_in_the_colors_of_each():
     """Two cameras back to back: neither sees what the other does."""
     ahead = frame_at(0)

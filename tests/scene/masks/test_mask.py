@@ -1,6 +1,7 @@
 """What every mask answers, and what a node does with it: the static one, and one that depends on time."""
 
 from dataclasses import replace
+from math import nan
 
 import pytest
 import torch
@@ -8,7 +9,14 @@ from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.masks import Mask, MaskSettings, StaticMask, StaticMaskSettings
+from sparsestreet.scene.masks import (
+    Mask,
+    MaskSettings,
+    SampledMaskSettings,
+    StaticMask,
+    StaticMaskSettings,
+    TemporalMaskSettings,
+)
 from sparsestreet.scene.nodes import Background
 from tests.scene.masks.stub import RisingMask, RisingSettings
 from tests.scene.street import (
@@ -24,6 +32,7 @@ from tests.scene.street import (
 )
 from tests.typed import as_a
 
+KINDS = StaticMaskSettings, TemporalMaskSettings, SampledMaskSettings
 MASKS = {"static": static_mask, "rising": RisingMask}
 both = pytest.mark.parametrize("make", MASKS.values(), ids=MASKS.keys())
 
@@ -179,3 +188,18 @@ def test_only_visible_rows_are_pushed_where_the_mask_says_so():
         torch.testing.assert_close(loss.detach(), (scores * counted).sum())
         (gradient,) = torch.autograd.grad(loss, rows.mask_logits)
         torch.testing.assert_close(gradient, scores * (1 - scores) * counted)
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "said"),
+    [
+        *((kind, {"sparsity_weight": value}, "sparsity_weight must") for kind in KINDS for value in (-0.1, nan)),
+        *((kind, {"threshold": value}, r"lie in \[0, 1\)") for kind in KINDS[:2] for value in (-0.1, 1.0, nan)),
+        *((TemporalMaskSettings, {name: 0}, "width >= 1") for name in ("features", "feature_times", "width")),
+        *((TemporalMaskSettings, {name: -1}, "octaves >= 0") for name in ("frames", "octaves")),
+        *((SampledMaskSettings, change, "a sampled mask needs") for change in ({"temperature": 0.0}, {"draws": 0})),
+    ],
+)
+def test_settings_that_cannot_be(kind: type, changes: dict[str, float], said: str):
+    with pytest.raises(ValueError, match=said):
+        kind(**({"sparsity_weight": 1.0} | changes))

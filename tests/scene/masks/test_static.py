@@ -8,9 +8,8 @@ import torch
 from hypothesis import given, settings
 
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.masks import StaticMaskSettings, straight_through
+from sparsestreet.scene.masks import straight_through
 from sparsestreet.scene.masks.static import lowered_threshold
-from tests.scene.gaussians.oracle import by_hand
 from tests.scene.street import static_mask
 
 # A coarse grid, so that ties and hits of the threshold are common; sigmoid(-150) is 0 in float32.
@@ -41,11 +40,6 @@ def test_one_sigmoid_only():
     logits = [-30.0, -4.6, 0.0, 1.0, 7.5]
     expected = torch.tensor([1 / (1 + math.exp(-x)) for x in logits])
     torch.testing.assert_close(static_mask().scores(rows_of(logits)).detach(), expected, rtol=1e-6, atol=0)
-
-
-def test_everything_can_be_pruned():
-    """Two sigmoids would never fall below 0.5, far above the threshold."""
-    assert opened(static_mask(), rows_of([-5.0] * 4)) == [0.0] * 4
 
 
 def test_the_start_is_the_logit_1_everywhere():
@@ -125,31 +119,6 @@ def test_scores_of_zero_can_reopen():
 
 
 @pytest.mark.lengthy
-@settings(max_examples=300, deadline=None)
-@given(logit_lists, st.sampled_from(GRID[1:-1]), st.integers(0, 14))
-def test_the_lowest_are_removed_one_by_one(logits, threshold, floor):
-    mask, rows = static_mask(floor, threshold=score_of(threshold)), rows_of(logits)
-    selection = mask.keep(rows)
-    scores = mask.scores(rows).tolist()
-    unwanted = [score <= score_of(threshold) for score in scores]
-    assert unwanted == [logit <= threshold for logit in logits]
-    assert selection.keep.tolist() == by_hand(scores, unwanted, floor)
-    assert selection.removed == len(logits) - int(selection.keep.sum())
-    assert selection.floor_hit == (selection.removed < sum(unwanted))
-
-
-@settings(max_examples=100, deadline=None)
-@given(logit_lists, st.integers(0, 14))
-def test_the_plan_keeps_survivors_in_order_with_their_moments(logits, floor):
-    selection = static_mask(floor).keep(rows_of(logits))
-    plan = selection.plan()
-    assert plan.source.tolist() == [row for row in range(len(logits)) if selection.keep[row]]
-    assert not plan.fresh.any()
-    assert not plan.edits
-    assert not plan.reset_moments
-
-
-@pytest.mark.lengthy
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.floats(-8, 2, width=32), max_size=12, unique=True), st.integers(0, 14))
 def test_rows_dropped_are_exactly_those_the_mask_has_closed(logits, floor):
@@ -185,31 +154,3 @@ def test_a_node_without_rows(floor: int):
     assert selection.plan().source.shape == (0,)
     assert opened(mask, rows_of([])) == []
     assert mask.sparsity(rows_of([]), 0.5, torch.zeros(0, dtype=torch.bool)).item() == 0.0
-
-
-def test_a_floor_above_the_rows_there_are_removes_nothing():
-    selection = static_mask(10).keep(rows_with([0.001, 0.5, 0.002]))
-    assert selection.keep.all()
-    assert selection.floor_hit
-
-
-def test_nan_logits_are_refused():
-    with pytest.raises(ValueError, match="row 1 of 2 is NaN"):
-        static_mask().keep(rows_of([0.5, float("nan")]))
-
-
-def test_a_negative_floor_is_refused():
-    with pytest.raises(ValueError, match="min_gaussians must be >= 0, got -1"):
-        static_mask(-1).keep(rows_of([0.0, 0.0]))
-
-
-@pytest.mark.parametrize("weight", [-0.1, float("nan")])
-def test_a_negative_weight_is_refused(weight: float):
-    with pytest.raises(ValueError, match="sparsity_weight must be >= 0"):
-        StaticMaskSettings(weight)
-
-
-@pytest.mark.parametrize("threshold", [-0.1, 1.0, float("nan")])
-def test_a_threshold_that_is_no_sigmoid_is_refused(threshold: float):
-    with pytest.raises(ValueError, match=r"must lie in \[0, 1\)"):
-        StaticMaskSettings(1.0, threshold=threshold)

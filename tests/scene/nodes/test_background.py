@@ -80,39 +80,8 @@ def test_the_mask_multiplies_opacity_and_scale_in_the_gradient():
     torch.testing.assert_close(rows.mask_logits.grad.double(), by_hand, rtol=1e-5, atol=1e-6)  # float32 sums
 
 
-def test_a_finished_mask_ends_the_masking():
-    mask = static_mask()
-    node = background(random_rows(3, 0, mask=mask), mask)
-    with torch.no_grad():
-        node.rows.mask_logits[0] = -9.0
-    node.finish_mask()
-    assert node.mask is None
-    assert (node.gaussians_at(view_at(0.0), degree(0)).opacities > 0).all()
-
-
-def test_the_image_of_a_masked_table_after_removal_is_the_same_gaussians():
-    mask = static_mask()
-    node = background(random_rows(7, 3, mask=mask), mask)
-    with torch.no_grad():
-        node.rows.mask_logits[::2] = -6.0
-    before = node.gaussians_at(view_at(0.0), degree(1))
-    alive = before.opacities > 0
-    node.rows.resize(mask.keep(node.rows).plan())
-    after = node.gaussians_at(view_at(0.0), degree(1))
-    for name in ("means", "quaternions", "scales", "opacities", "sh"):
-        assert torch.equal(getattr(before, name)[alive], getattr(after, name))
-
-
 def test_sizes_are_float32_without_the_mask():
     mask = static_mask()
     node = background(random_rows(3, 0, sh_degree=3, mask=mask), mask)
     assert node.row_bytes() == 3 * 59 * 4  # 3 + 3 + 4 + 1 + 48, the 59 numbers of 3DGS
     assert node.pose_bytes() == 0
-
-
-def test_an_empty_node():
-    mask = static_mask(5)
-    node = background(random_rows(0, 0, mask=mask), mask)
-    assert len(node.gaussians_at(view_at(0.0), degree(1))) == 0
-    assert mask.scores(node.rows).shape == (0,)
-    assert mask.keep(node.rows).removed == 0

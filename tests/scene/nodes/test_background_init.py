@@ -8,11 +8,8 @@ from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
 from sparsestreet.scene.initialize.sources import LidarPoints, NearPoints
-from sparsestreet.scene.masks import StaticMaskSettings
-from sparsestreet.scene.masks.static import StaticMask
 from sparsestreet.scene.nodes import Background, BackgroundSettings, RigidSettings
 from sparsestreet.triangulation import StreetPoints
-from sparsestreet.types import Sweep
 from tests.scene.street import (
     CAR_COLOR,
     NUM_FRAMES,
@@ -24,7 +21,6 @@ from tests.scene.street import (
     training_data,
     triangulated,
 )
-from tests.typed import as_a
 
 LIDAR_ONLY = background_settings(lidar=10_000)
 MOVERS = rigid_settings(classes=("Car", "Cyclist"))
@@ -179,38 +175,6 @@ def test_a_source_draws_what_it_draws_without_the_others():
 def test_sources_that_cannot_be(changes: dict, said: str):
     with pytest.raises(ValueError, match=said):
         background_settings(**changes)
-
-
-def test_the_same_seed_gives_the_same_rows():
-    settings = background_settings(lidar=40, near=30, far=20)
-    first, second, other = build(settings), build(settings), build(settings, seed=1)
-    assert all(torch.equal(a, b) for a, b in zip(first.parameters(), second.parameters(), strict=True))
-    assert not torch.equal(first.rows.means, other.rows.means)
-
-
-def test_duplicated_returns_start_finite():
-    log = street_log()
-    sweep = log.sweeps[0]
-    doubled = Sweep(0, 0.0, sweep.points.repeat(5, 1), sweep.colors.repeat(5, 1), sweep.colored.repeat(5))
-    node = build(LIDAR_ONLY, log=replace(log, sweeps=Sweeps.of((doubled,))))
-    assert torch.isfinite(node.rows.log_scales).all()
-    assert all(torch.isfinite(parameter).all() for parameter in node.parameters())
-
-
-def test_a_mask_arrives_at_the_node():
-    settings = replace(LIDAR_ONLY, mask=StaticMaskSettings(0.5), min_gaussians=3, masked=True)
-    node = build(settings)
-    assert node.settings is settings
-    assert node.mask.settings is settings.mask
-    assert node.mask.min_gaussians == 3
-    assert node.mask.sparsity_weight == 0.5
-    assert as_a(StaticMask, node.mask).scores(node.rows).shape == (len(node.rows),)
-
-
-def test_a_mask_that_is_not_trained_in_this_run_leaves_no_column():
-    node = build(replace(LIDAR_ONLY, mask=StaticMaskSettings(0.5), masked=False))
-    assert node.mask is None
-    assert "mask_logits" not in node.rows.columns()
 
 
 def test_a_log_without_lidar_starts_from_images_and_guesses(caplog):

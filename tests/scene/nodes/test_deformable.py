@@ -12,9 +12,8 @@ from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import TemporalMaskSettings
 from sparsestreet.scene.masks.temporal import TemporalMask
 from sparsestreet.scene.nodes import Deformable, DeformableSettings, NetworkSettings
-from sparsestreet.scene.rendering import RenderOptions, render
+from sparsestreet.scene.rendering import render
 from sparsestreet.scene.state import FINISHED, SceneState
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from tests.scene.street import (
     POSE_RATES,
     RATES,
@@ -189,30 +188,11 @@ def test_rows_come_and_go():
     node.rows.resize(RowPlan(5, torch.tensor([3, 3, 0]), torch.tensor([False, True, True])))
     raw = node.raw_at(view_at(LATER), FINISHED)
     torch.testing.assert_close(raw.means[0], raw.means[1])  # a product of matrices sums rows in their own order
+    network = sum(parameter.numel() for parameter in node.network.parameters())
+    assert node.pose_bytes() == 4 * (8 * 7 + 3 * 3 + network)
+    nobody = Deformable(node.settings, objects(0).rows, keyframes([], 5), torch.zeros(0, 3))
+    assert len(nobody.gaussians_at(view_at(LATER), FINISHED)) == 0
     empty = objects(0)
     raw = empty.raw_at(view_at(LATER), FINISHED)
     assert len(raw) == 0
     assert float(empty.own_regularizers(raw, torch.zeros(0, dtype=torch.bool), FINISHED)["out_of_box"].detach()) == 0.0
-
-
-def test_a_node_without_instances():
-    rows = random_rows(0, 0, instances=torch.zeros(0, dtype=torch.int64))
-    node = Deformable(deformable_settings(), rows, keyframes([], 5), torch.zeros(0, 3))
-    assert len(node.gaussians_at(view_at(LATER), FINISHED)) == 0
-
-
-def test_a_scene_file_keeps_it(tmp_path):
-    node = objects(outside_weight=0.7, refine_boxes=False)
-    stored = StoredScene(SceneGraph({"objects": node}), RenderOptions(), "hand-made", 5)
-    save_scene(tmp_path / "scene.safetensors", stored)
-    loaded = load_scene(tmp_path)
-    again = as_a(Deformable, loaded.scene.nodes["objects"])
-    assert again.settings == replace(node.settings, classes=list(node.settings.classes))
-    assert again.instances().names == ("bicycle", "walker", "unseen")
-    assert torch.equal(again.embeddings, node.embeddings)
-    for time in (0.0, LATER, 1.0):
-        view = view_at(time, camera_at(0.0))
-        assert torch.equal(loaded.render(view).rgb, stored.render(view).rgb)
-        assert loaded.render(view).rgb.any()
-    network = sum(parameter.numel() for parameter in again.network.parameters())
-    assert node.pose_bytes() == 4 * (8 * 7 + 3 * 3 + network)

@@ -11,9 +11,8 @@ from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.nodes import Field, FieldSettings, NetworkSettings
-from sparsestreet.scene.rendering import RenderOptions, render
+from sparsestreet.scene.rendering import render
 from sparsestreet.scene.state import FINISHED, SceneState
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from tests.scene.street import RATES, background_settings, camera_at, random_rows, street_log, training_data, view_at
 from tests.typed import as_a, there
 
@@ -164,6 +163,7 @@ def test_it_starts_as_the_background_and_knows_its_log():
     again = settings.build(data, torch.Generator().manual_seed(3))
     assert torch.equal(again.network.first.of_row.weight, node.network.first.of_row.weight)
     assert again.seed == node.seed
+    assert node.pose_bytes() == 4 * sum(parameter.numel() for parameter in node.network.parameters())
 
 
 def test_rows_come_and_go():
@@ -172,22 +172,6 @@ def test_rows_come_and_go():
     raw = node.raw_at(view_at(0.3), FINISHED)
     torch.testing.assert_close(raw.means[0], raw.means[1])  # a product of matrices sums rows in their own order
     assert len(street(0).raw_at(view_at(0.3), state(0.5, training=True))) == 0
-
-
-def test_a_scene_file_keeps_it(tmp_path):
-    node = street()
-    stored = StoredScene(SceneGraph({"street": node}), RenderOptions(), "hand-made", NUM_FRAMES)
-    save_scene(tmp_path / "scene.safetensors", stored)
-    loaded = load_scene(tmp_path)
-    again = as_a(Field, loaded.scene.nodes["street"])
-    assert torch.equal(again.box_from_world, BOX)
-    assert (again.frame_periods, again.seed) == (NUM_FRAMES - 1, 5)
-    assert again.settings.network == NETWORK
-    for time in (0.0, 0.4, 1.0):
-        assert torch.equal(loaded.render(view_at(time, camera_at(-6.0))).rgb,
-                           stored.render(view_at(time, camera_at(-6.0))).rgb)  # fmt: skip
-    assert node.pose_bytes() == 4 * sum(p.numel() for p in again.network.parameters())
-    assert loaded.scene.bytes_by_part()["poses"] == node.pose_bytes()
 
 
 def test_a_reach_that_cannot_be():

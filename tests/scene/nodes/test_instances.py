@@ -1,6 +1,7 @@
 """A node's objects keep their rows and names through density control, pruning and storage."""
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from sparsestreet.ops import SplatSettings
 from sparsestreet.scene.density import DensityStatistics, GradientDensity
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes import NodeSettings, Rigid
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from tests.scene.street import (
@@ -132,22 +133,25 @@ def test_what_stands_still_has_neither_objects_nor_bounds():
     assert node.header() == {}
 
 
-def test_rows_of_no_object():
-    node = three_objects()
-    node.rows.resize(RowPlan.keep(torch.zeros(9, dtype=torch.bool)))
-    assert node.outside().shape == (0,)
-    assert node.instances().counts().tolist() == [0, 0, 0]
-    assert node.instances().names == tuple(NAMES)
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"min_gaussians": -1}, "min_gaussians must be >= 0, got -1"),
+        ({"max_gaussians": 0}, "max_gaussians must be >= 1 or null, got 0"),
+        ({"sharp_shape": -1.0}, r"got -1\.0 and 10\.0"),
+        ({"max_axis_ratio": 0.5}, r"ratio >= 1, got 0\.0 and 0\.5"),
+        ({"sharp_shape_every": 0}, "sharp_shape_every counts steps"),
+        ({"temporal_smooth": -0.1}, "temporal_smooth is a weight"),
+    ],
+)
+def test_settings_that_cannot_be(changes: dict[str, Any], said: str):
+    with pytest.raises(ValueError, match=said):
+        rigid_settings(**changes)
 
 
-@pytest.mark.parametrize("make", [background_settings, rigid_settings])
-def test_limits_below_zero_or_one_are_refused(make: type[NodeSettings]):
-    with pytest.raises(ValueError, match="min_gaussians must be >= 0, got -1"):
-        make(min_gaussians=-1)
-    with pytest.raises(ValueError, match="max_gaussians must be >= 1 or null, got 0"):
-        make(max_gaussians=0)
-    # The paper's K_min of moving objects is above the limit of a small run: then nothing is removed (training/floors).
-    assert make(min_gaussians=5, max_gaussians=4).max_gaussians == 4
+def test_the_floor_of_a_node_may_be_above_its_limit():
+    """The paper's K_min of moving objects is above that of a small run: then nothing is removed (training/floors)."""
+    assert rigid_settings(min_gaussians=5, max_gaussians=4).max_gaussians == 4
 
 
 def test_a_node_is_said_by_its_fields_only():

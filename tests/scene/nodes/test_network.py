@@ -86,13 +86,6 @@ def test_it_starts_at_zero_and_learns_from_the_last_layer():
     assert network.last.weight.grad.any()
 
 
-def test_scales_can_be_left_alone():
-    network = DeformationNetwork(NetworkSettings(width=8, depth=2, skip=0, scales=False))
-    made = network(torch.rand(5, 3), 0.2)
-    assert made.log_scales is None
-    assert made.quaternions.shape == (5, 4)
-
-
 def test_weights_are_those_of_the_seed_and_leave_other_draws_alone():
     torch.manual_seed(5)
     following = torch.rand(3)
@@ -101,12 +94,6 @@ def test_weights_are_those_of_the_seed_and_leave_other_draws_alone():
     assert torch.equal(torch.rand(3), following)
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
-
-
-def test_no_rows():
-    assert DeformationNetwork(SMALL)(torch.zeros(0, 3), 0.5).means.shape == (0, 3)
-    network = DeformationNetwork(SMALL, features=2)
-    assert len(network(torch.zeros(0, 3), 0.5, torch.zeros(1, 2), torch.zeros(0, dtype=torch.int64)).means) == 0
 
 
 @pytest.mark.parametrize(

@@ -59,10 +59,6 @@ def test_the_node_puts_the_points_back_where_lidar_saw_them():
     assert nearest.max() < 1e-4  # float32 keyframes and points at 20 m
 
 
-def test_a_sample_of_many_points():
-    assert instance_counts(build(replace(CARS, points_per_instance=70))) == [70]
-
-
 def test_few_points_are_filled_up_on_the_box():
     node = build(replace(CARS, box_points=50), log=street_log(car_points=2))
     assert instance_counts(node) == [50]
@@ -130,9 +126,3 @@ def test_held_out_frames_give_neither_points_nor_poses():
 
 def test_a_track_only_in_held_out_frames_is_left_out():
     assert build(replace(CARS, classes=("Cyclist",)), held_out=frozenset({1, 2})) is None
-
-
-def test_the_gap_is_counted_in_frames():
-    tracks = (track("car", [0, 4], [car_pose(0), car_pose(4)]),)
-    node = build(replace(CARS, max_gap=1), log=replace(street_log(), tracks=tracks))
-    assert [node.pose_at(frame / 4).present.item() for frame in range(5)] == [True, True, False, True, True]

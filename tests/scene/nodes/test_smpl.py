@@ -11,14 +11,11 @@ from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import JOINTS
 from sparsestreet.scene.body import BuiltinBody, surface
 from sparsestreet.scene.gaussians import RowPlan
-from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
-from sparsestreet.scene.masks import StaticMaskSettings, TemporalMaskSettings
+from sparsestreet.scene.masks import TemporalMaskSettings
 from sparsestreet.scene.masks.temporal import TemporalMask
 from sparsestreet.scene.nodes import Smpl
-from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import FINISHED, SceneState
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
 from sparsestreet.triangulation import StreetPoints
 from sparsestreet.types import Track
 from tests.geometry.test_skeleton import oracle
@@ -329,23 +326,6 @@ def test_gradients_of_corrections_are_finite_differences():
     joints = 0.1 * torch.randn(node.joint_deltas.shape, generator=generator, dtype=torch.float64)
     inputs = (joints.requires_grad_(), node.rows.means.detach().clone().requires_grad_())
     assert torch.autograd.gradcheck(placed, inputs, fast_mode=True)
-
-
-@pytest.mark.parametrize("mask", [None, StaticMaskSettings(1e-4), TemporalMaskSettings(1e-4)])
-def test_a_scene_file_brings_people_back(mask, tmp_path):
-    node = smpl(walker(), walker("other", y=2.0, seed=4), mask=mask, masked=mask is not None)
-    with torch.no_grad():
-        node.joint_deltas.add_(0.1 * torch.randn(node.joint_deltas.shape, generator=torch.Generator().manual_seed(2)))
-        node.rotation_deltas.add_(0.1)
-    save_scene(tmp_path / "scene.safetensors", StoredScene(SceneGraph({"people": node}), RenderOptions(), "x", 5))
-    again = load_scene(tmp_path / "scene.safetensors").scene.nodes["people"]
-    assert isinstance(again, Smpl)
-    assert (again.names, again.settings) == (node.names, replace(node.settings, classes=["Pedestrian"]))
-    for time in (0.1, 0.5):
-        first, second = (person.gaussians_at(view_at(time), FINISHED) for person in (node, again))
-        assert torch.equal(first.means, second.means)
-        assert torch.equal(first.quaternions, second.quaternions)
-    assert again.pose_bytes() == node.pose_bytes()
 
 
 def test_bytes_of_poses():

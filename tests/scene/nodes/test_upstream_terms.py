@@ -29,8 +29,6 @@ def test_the_term_against_needles_comes_at_every_tenth_step():
     assert [step for step, found in enumerate(terms) if found] == [0, 10, 20]
     expected = 0.5 * sharp_shape_ratio(node.rows.log_scales, 2.0)
     assert terms[0]["sharp_shape"].item() == pytest.approx(expected.item())
-    with pytest.raises(ValueError, match="sharp_shape_every counts steps"):
-        background(random_rows(2, 0), sharp_shape_every=0)
 
 
 def test_volumes_beyond_their_quantile():

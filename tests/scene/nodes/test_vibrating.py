@@ -6,25 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.ops import SplatSettings
-from sparsestreet.scene.gaussians import RowPlan, Rows
-from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.scene.nodes import Vibrating, VibratingSettings
-from sparsestreet.scene.rendering import RenderOptions, render
 from sparsestreet.scene.state import FINISHED, SceneState
-from sparsestreet.scene.storage import StoredScene, load_scene, save_scene
-from tests.scene.street import (
-    RATES,
-    background_settings,
-    camera_at,
-    random_rows,
-    static_mask,
-    street_log,
-    training_data,
-    view_at,
-)
+from tests.scene.street import RATES, background_settings, random_rows, static_mask, street_log, training_data, view_at
 from tests.typed import as_a
 
 NUM_FRAMES = 31
@@ -94,15 +80,6 @@ def test_the_swing_repeats_with_the_cycle_and_a_finished_scene_is_not_smoothed()
     torch.testing.assert_close(first, again, rtol=0, atol=1e-5)
     torch.testing.assert_close(first.double(), by_hand(node, 0.1)[0], rtol=0, atol=1e-5)
     assert not torch.allclose(first, between, atol=0.1)
-
-
-def test_the_op_culls_what_has_faded():
-    node = vibrating(200)
-    scene = SceneGraph({"street": node})
-    radii = render(scene, view_at(0.5, camera_at(-6.0)), options=RenderOptions(SplatSettings())).splats.radii
-    hidden = by_hand(node, 0.5)[2] <= 0.05
-    assert not radii[hidden].any()
-    assert radii[~hidden].any()
 
 
 @pytest.mark.lengthy
@@ -224,26 +201,6 @@ def test_a_node_without_rows():
     assert float(node.own_regularizers(raw, torch.zeros(0, dtype=torch.bool), FINISHED)["velocity"].detach()) == 0.0
 
 
-def test_its_columns_follow_the_rows():
-    node = vibrating(5)
-    before = {name: column.detach().clone() for name, column in node.rows.columns().items()}
-    source = torch.tensor([4, 0, 0])
-    node.rows.resize(RowPlan(5, source, torch.tensor([False, False, True])))
-    assert all(torch.equal(node.rows.columns()[name], before[name][source]) for name in NAMES)
-    assert node.row_bytes() == 3 * 4 * (3 + 3 + 4 + 1 + 12 + 3 + 1 + 1)
-
-
-def test_a_scene_file_keeps_it(tmp_path):
-    node = vibrating(velocity_weight=0.25, mask=None)
-    stored = StoredScene(SceneGraph({"street": node}), RenderOptions(), "hand-made", NUM_FRAMES)
-    save_scene(tmp_path / "scene.safetensors", stored)
-    loaded = load_scene(tmp_path)
-    again = as_a(Vibrating, loaded.scene.nodes["street"])
-    assert (again.frame_periods, again.seed, again.settings.velocity_weight) == (NUM_FRAMES - 1, 7, 0.25)
-    for time in (0.0, 0.4, 1.0):
-        assert torch.equal(loaded.render(view_at(time)).rgb, stored.render(view_at(time)).rgb)
-
-
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -258,10 +215,3 @@ def test_a_scene_file_keeps_it(tmp_path):
 def test_settings_that_cannot_be(changes: dict, said: str):
     with pytest.raises(ValueError, match=said):
         vibrating_settings(lidar=1, **changes)
-
-
-def test_a_mask_is_built_with_it():
-    settings = vibrating_settings(lidar=30, mask=StaticMaskSettings(1e-3), masked=True)
-    node = settings.build(training_data(), torch.Generator().manual_seed(0))
-    assert node.rows.transient == {"mask_logits"}
-    assert len(node.gaussians_at(view_at(0.0), FINISHED)) == 30
