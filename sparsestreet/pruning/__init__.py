@@ -1,8 +1,8 @@
 """Scores Gaussians over all training views and selects which to keep.
 
-``rule`` is the interface of the rules, ``importance`` the paper's score, ``rules`` the paper's rule and ours (leave
-one out). ``published`` has the rules of other papers, ``controls`` those that look at no image. ``counts`` keep a given
-number of each node, ``select`` drops rows by scores but respects the ``floors`` of a node and its instances.
+``importance`` has the paper's score, the rules of other papers and those that look at no image; ``rules`` the paper's
+rule and ours (leave one out). ``select`` has their interface. It drops rows by scores but respects the floors of a node
+and its instances, or keeps a given number of each node.
 """
 
 from sparsestreet.pruning.importance import (
@@ -11,7 +11,6 @@ from sparsestreet.pruning.importance import (
     MiniSplattingRule,
     OpacityRule,
     RandomRule,
-    measure_importance,
 )
 from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
 from sparsestreet.pruning.select import (
@@ -39,5 +38,4 @@ __all__ = [
     "keep_by_cost",
     "keep_by_importance",
     "keep_by_rank",
-    "measure_importance",
 ]

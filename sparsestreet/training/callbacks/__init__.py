@@ -1,9 +1,7 @@
 """Callbacks know WHEN; what they apply is decided by pure functions in scene/density, scene/masks and pruning.
 
-They act in the order in which they are configured: ``density_control``, ``mask_training``, ``pruning``, all
-through ``resizing``. ``row_ledger``, ``phase_times``, ``held_out_curve`` and ``progress`` look on, ``clock`` and
-``stage_times`` count seconds, ``pace`` foretells them;
-``checkpoints``, ``run_files`` and ``graceful_stop`` see to what a run leaves, also one that is interrupted.
+They act in the order in which they are configured: ``density_control``, then ``sparsify``. ``times`` and ``progress``
+look on; ``files`` sees to what a run leaves, also one that is interrupted.
 """
 
 from sparsestreet.training.callbacks.density_control import DensityControl

@@ -5,12 +5,8 @@ there, but the returns of this sweep and of those before and after it, in the co
 many of its pixels show. Fused lidar as a target beside the path follows LiDAR-EVS (arXiv 2603.14763) and FlexDrive
 (arXiv 2502.21093) in idea; the form is ours.
 
-    settings    how often, how far, and how much the terms weigh
-    returns     the street's returns, and those of cars in the frames of their boxes
-    coloring    the color of a return, and how far images of other instants agree with it
-    target      what returns say of the pixels of a camera
-    term        the terms of a step
-    build       from a log to its terms
+``returns`` has the settings, the colored returns of the street and of cars, and what they say of the pixels of a
+camera; ``term`` the terms of a step, and the way from a log to them.
 """
 
 from sparsestreet.training.moved_views.returns import MovedViews

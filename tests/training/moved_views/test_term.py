@@ -192,20 +192,14 @@ def test_a_camera_keeps_off_walls():
 
 
 def test_a_step_adds_the_terms_and_one_without_them_is_as_before():
-    def loss(term: MovedViewTerm | None) -> float:
+    def step(every: int | None) -> tuple[float, bool]:
+        term = None if every is None else MovedViewTerm(MovedViews(every=every), street(wall(4.0)), seed=7)
         trainer = StubTrainer(make_system({"background": background(40, seed=3)}, moved_views=term), max_steps=12)
         trainer.global_step = 6
         value = trainer.system.training_step(frame_at(0, WIDTH, HEIGHT), 0).item()
-        names = trainer.system.said.newest.keys()
-        assert ({"train/moved_depth", "train/moved_color"} <= names) == (value != plain)
-        return value
+        return value, {"train/moved_depth", "train/moved_color"} <= trainer.system.said.newest.keys()
 
-    plain = make_loss_alone()
-    assert loss(MovedViewTerm(MovedViews(every=3), street(wall(4.0)), seed=7)) > plain
-    assert loss(MovedViewTerm(MovedViews(every=5), street(wall(4.0)), seed=7)) == plain
-
-
-def make_loss_alone() -> float:
-    trainer = StubTrainer(make_system({"background": background(40, seed=3)}), max_steps=12)
-    trainer.global_step = 6
-    return trainer.system.training_step(frame_at(0, WIDTH, HEIGHT), 0).item()
+    (plain, _), (with_terms, said) = step(None), step(3)
+    assert with_terms > plain
+    assert said
+    assert step(5) == (plain, False)
