@@ -2,6 +2,7 @@
 error names file, free space and remedy. The system itself refuses: no file may grow beyond a few bytes."""
 
 import resource
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,9 +23,12 @@ def no_room(limit: int) -> Iterator[None]:
     """Files end at ``limit`` bytes: writes beyond it fail as they do on a full disk (EFBIG in place of ENOSPC)."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    # An import would leave half a compiled module, which no later process can read.
+    compiled, sys.dont_write_bytecode = sys.dont_write_bytecode, True
     try:
         yield
     finally:
+        sys.dont_write_bytecode = compiled
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 

@@ -155,13 +155,6 @@ def test_the_scene_itself_is_measured(tmp_path):
     assert set(node_legend(["road", "cars"]).values()) < colors
 
 
-def test_alarms_are_recorded(tmp_path, monkeypatch):
-    monkeypatch.setattr(run_module, "guards", lambda *arguments, settings: Guards(drawn=2, vanished=1))
-    counted = evaluate(tmp_path, make_frames(3)).guards
-    assert counted.alarms == {"vanished": 3}
-    assert counted.rows["drawn"] == 6
-
-
 @pytest.mark.usefixtures("dark")
 def test_images_are_let_go_one_by_one(tmp_path):
     """However long a log is: of both splits no more than the image at hand is in memory."""

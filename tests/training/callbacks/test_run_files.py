@@ -97,6 +97,10 @@ def test_run_json_names_the_nodes_that_their_limit_held_down(trainer, tmp_path):
     resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(9) < 2), "cull")
     callback.on_train_end(trainer, system)
     assert RUN.read(tmp_path).caps == {"background": 10}
+    torch.save(callback.state_dict(), tmp_path / "state.pt")
+    resumed = RunFiles(tmp_path, make_run(), Clock())
+    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert resumed.caps == {"background": 10}
 
 
 def test_a_cull_to_the_limit_is_no_limit_that_held(tmp_path):
@@ -105,11 +109,3 @@ def test_a_cull_to_the_limit_is_no_limit_that_held(tmp_path):
     trainer = StubTrainer(system, [callback])
     resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(8) < 6), "cull")
     assert callback.caps == {}
-
-
-def test_a_resumed_run_remembers_the_limits(trainer, tmp_path):
-    resize_rows(trainer, trainer.system, "background", grown(4, 6), "densify")
-    torch.save(trainer.callbacks[0].state_dict(), tmp_path / "state.pt")
-    resumed = RunFiles(tmp_path, make_run(), Clock())
-    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    assert resumed.caps == {"background": 10}
