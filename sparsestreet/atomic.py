@@ -4,7 +4,7 @@ import errno
 import os
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -45,28 +45,19 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     # The suffix stays, because some writers choose the format by it.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    try:
+    with _writable(path):
         if path.is_dir():
             raise IsADirectoryError(0, "it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary.touch()
         mode = temporary.stat().st_mode
         temporary.unlink()
-    except OSError as error:
-        raise _unwritable(path, error) from error
-    try:
+    with _whole(path, lambda: temporary.unlink(missing_ok=True)):
         yield temporary
         if temporary.exists():
             # Some writers (safetensors) leave a file that only its owner may read.
             temporary.chmod(mode)
             os.replace(temporary, path)
-    except Exception as error:
-        temporary.unlink(missing_ok=True)
-        if _is_full(error):
-            raise _full(path, error) from error
-        raise
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -83,28 +74,37 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     ['log.txt']
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
+    with _writable(path):
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise FileExistsError(0, "it exists and is no empty folder")
         temporary.mkdir(parents=True)
-    except OSError as error:
-        raise _unwritable(path, error) from error
-    try:
+    with _whole(path, lambda: shutil.rmtree(temporary, ignore_errors=True)):
         yield temporary
         if path.is_dir():
             path.rmdir()
         os.replace(temporary, path)
+
+
+@contextmanager
+def _writable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OSError(f"{path} cannot be written ({error.strerror}): name another place") from error
+
+
+@contextmanager
+def _whole(path: Path, remove: Callable[[], object]) -> Iterator[None]:
+    """Remove what is half written however the block ends; an error of a full disk says so."""
+    try:
+        yield
     except Exception as error:
-        shutil.rmtree(temporary, ignore_errors=True)
+        remove()
         if _is_full(error):
             raise _full(path, error) from error
         raise
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _unwritable(path: Path, error: OSError) -> OSError:
-    return OSError(f"{path} cannot be written ({error.strerror}): name another place")
+        remove()
 
 
 def _is_full(error: Exception) -> bool:

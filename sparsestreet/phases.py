@@ -59,7 +59,7 @@ def clock_of(device: torch.device) -> Timer:
 class Timeline:
     """Adds up seconds by name; the name changes with ``enter`` and ``leave``."""
 
-    def __init__(self, clock: Timer, outside: str) -> None:
+    def __init__(self, clock: Timer, outside: str = "rest") -> None:
         """``outside`` names the time outside of all other names."""
         self._clock = clock
         self._names = [outside]
@@ -94,9 +94,6 @@ class Timeline:
 
 class PhaseRecorder(Timeline):
     """Records the seconds of each phase between ``start`` and ``stop``."""
-
-    def __init__(self, clock: Timer, outside: str = "rest") -> None:
-        super().__init__(clock, outside)
 
     def start(self) -> None:
         """Record from now on; raise RuntimeError while another recorder does."""

@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from sparsestreet.atomic import atomic_file, atomic_folder, check_regular
-from sparsestreet.data.colmap import model
+from sparsestreet.data.colmap import reader as colmap
 from sparsestreet.data.images import check_pixels, image_size, read_image
 from sparsestreet.data.nuscenes.tables import all_rows
 from sparsestreet.data.ply import read_ply
@@ -119,8 +119,8 @@ READERS = {
     "record": read_text,
     "table": all_rows,
     "checkpoint": step_of,
-    "colmap": lambda path: [*model.binary_camera_rows(path)],
-    "colmap text": lambda path: [*model.text_camera_rows(path)],
+    "colmap": lambda path: [*colmap.binary_camera_rows(path)],
+    "colmap text": lambda path: [*colmap.text_camera_rows(path)],
 }
 """Some of those that open files of others."""
 

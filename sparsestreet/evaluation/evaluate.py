@@ -172,22 +172,6 @@ def _of_all(
             yield quality
 
 
-def evaluate_predictions(
-    predictions: Predictions,
-    frames: Iterable[Frame],
-    device: torch.device,
-    lpips: Mapping[str, Lpips] | None = None,
-) -> Iterator[FrameQuality]:
-    """The quality of stored predictions of frames, without the scene; otherwise as ``evaluate_frames``.
-
-    Raises PredictionError for a prediction that is absent or damaged.
-    """
-    metrics = reported_metrics(lpips or {})
-    for frame in frames:
-        pixels = predictions.read(*frame.indices)
-        yield _quality(pixels, frame, device, metrics)
-
-
 def _quality(
     pixels: UInt16[np.ndarray, "h w 3"], frame: Frame, device: torch.device, metrics: Mapping[str, ImageMetric]
 ) -> FrameQuality:

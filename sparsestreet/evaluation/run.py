@@ -11,7 +11,7 @@ from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, as_frames, spread
 from sparsestreet.evaluation.evaluate import Predictions, evaluate_frames, lidar_masks, screen_image
-from sparsestreet.evaluation.speed import Timing, measure_latency, measure_scene_costs
+from sparsestreet.evaluation.speed import Timing, measure_latency, measure_scene_costs, to_uint8
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips import open_lpips
 from sparsestreet.ops import Guards, guards
@@ -280,4 +280,4 @@ def _picture(scene: SceneGraph, frame: Frame, options: RenderOptions) -> Picture
 
 
 def _uint8(image: Float[Tensor, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    return (image.detach().clamp(0, 1) * 255).round().byte().cpu().numpy()
+    return to_uint8(image.detach()).cpu().numpy()

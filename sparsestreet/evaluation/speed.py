@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import groupby
 from operator import sub
 from pathlib import Path
@@ -109,9 +110,17 @@ def measure_latency(
     kept = clocks.measure(_cycled(views, repeats), _cycled(rigs, repeats), warmup)
     removed = {}
     if has_masks(scene):
-        times_of_a_rig = max(len({view.time for view in rig}) for rig in rigs)
-        clocks = _Clocks(_WithoutClosedRows(scene, options, times_of_a_rig), options, scene.device)
         in_order = [view for rig in rigs for view in rig]
+        view_at = {view.time: view for view in in_order}
+
+        # As many are kept as the views of an instant have different times.
+        @lru_cache(maxsize=max(len({view.time for view in rig}) for rig in rigs))
+        def opened(time: float) -> SceneGraph:
+            made = without_closed_rows(scene, time)
+            frame_image(made, view_at[time], options)  # once whenever it is made
+            return made
+
+        clocks = _Clocks(lambda view: opened(view.time), options, scene.device)
         removed = clocks.measure(_stretched(in_order, repeats), _stretched(rigs, repeats), warmup)
     noise = noise_between(before, calibrate(scene.device))
     return Latency(
@@ -178,29 +187,6 @@ class _Clocks:
         work()
         _wait_for(self._device)
         return 1000 * (time.perf_counter() - start)
-
-
-class _WithoutClosedRows:
-    """The scene without the rows that are closed at the time of a view; it is drawn once whenever it is made.
-
-    The last few are kept: as many as the views of an instant have different times.
-    """
-
-    def __init__(self, scene: SceneGraph, options: RenderOptions, kept: int) -> None:
-        self._scene = scene
-        self._options = options
-        self._kept = kept
-        self._made: dict[float, SceneGraph] = {}
-
-    def __call__(self, view: View) -> SceneGraph:
-        scene = self._made.pop(view.time, None)
-        if scene is None:
-            scene = without_closed_rows(self._scene, view.time)
-            frame_image(scene, view, self._options)
-        self._made[view.time] = scene
-        if len(self._made) > self._kept:
-            del self._made[next(iter(self._made))]
-        return scene
 
 
 def _cycled(items: Sequence[T], count: int) -> list[T]:

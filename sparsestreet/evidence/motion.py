@@ -42,12 +42,9 @@ def readout_shear(views: Sequence[View], sweeps: Sweeps, quantile: float = SHEAR
     rolling = [view for view in views if view.camera.shutter is not None]
     if not rolling:
         raise ValueError("shear is that of a rolling shutter, and no view has one: ask cameras with Camera.shutter")
-    places = {index: place for place, index in enumerate(sweeps.indices)}
     quantiles, points = [], 0
     for view in (rolling[index] for index in spread(len(rolling), MAX_VIEWS)):
-        index, _ = view.indices
-        world = sweeps[places[index]].points if index in places else _at_distance(view.camera)
-        moved = _moved(view.camera, world)
+        moved = _moved(view.camera, _static_points(view, sweeps))
         if len(moved):
             quantiles.append(moved.quantile(quantile))
             points += len(moved)
@@ -58,11 +55,17 @@ def readout_shear(views: Sequence[View], sweeps: Sweeps, quantile: float = SHEAR
 
 def shear_over(view: View, sweeps: Sweeps) -> tuple[Float[Tensor, "m 2"], Float[Tensor, " m"]]:
     """Pixels of the static points that a view with a shutter sees, and by how many pixels each moves meanwhile."""
-    index, _ = view.indices
-    places = {index: place for place, index in enumerate(sweeps.indices)}
-    world = sweeps[places[index]].points if index in places else _at_distance(view.camera)
+    world = _static_points(view, sweeps)
     pixels, _, inside = project(view.camera, world)
     return pixels[inside], _moved(view.camera, world)
+
+
+def _static_points(view: View, sweeps: Sweeps) -> Float[Tensor, "n 3"]:
+    """Those of the sweep of its frame, in the world; points 10 m away where there is none."""
+    index, _ = view.indices
+    if index in sweeps.indices:
+        return sweeps[sweeps.indices.index(index)].points
+    return _at_distance(view.camera)
 
 
 def _moved(camera: Camera, world: Float[Tensor, "n 3"]) -> Float[Tensor, " m"]:

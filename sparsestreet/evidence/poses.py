@@ -233,7 +233,7 @@ def _constant(stretches: Sequence[_Stretch]) -> float:
 
 
 def _stretch(frames: Frames, moving: Sequence[Track]) -> _Stretch | None:
-    found = street_points(_without_car(frames), moving, POINTS).static
+    found = street_points(frames, moving, POINTS).static
     if not len(found):
         return None
     bundle = adjust(_observations(found, frames.views), found.views, len(frames))
@@ -270,19 +270,6 @@ def _stretches(views: Sequence[View]) -> list[list[int]]:
     return [
         [place for instant in instants[start : start + INSTANTS] for place in by_instant[instant]] for start in starts
     ]
-
-
-def _without_car(frames: Frames) -> Frames:
-    """The recording car stands still in every image, so its pixels count as those of the sky: for nothing."""
-    places = {view.indices: place for place, view in enumerate(frames.views)}
-
-    def load(view: View) -> Frame:
-        frame = frames[places[view.indices]]
-        if frame.ego is None:
-            return frame
-        return replace(frame, sky=frame.ego if frame.sky is None else frame.sky | frame.ego)
-
-    return Frames(frames.views, load)
 
 
 def _observations(points: TriangulatedPoints, views: Sequence[View]) -> Observations:

@@ -18,22 +18,13 @@ INCEPTION = "inception"
 """Name of the one extractor whose Frechet distance may be called FID."""
 
 
-def frechet_name(extractor: str) -> str:
-    """The name in records of the Frechet distance of an extractor's features: "fid" only for Inception.
+def distance_names(extractor: str) -> tuple[str, str]:
+    """Return the names in records of the two distances of an extractor's features: "fid" and "kid" only for Inception.
 
-    >>> frechet_name("inception"), frechet_name("lpips_alex")
-    ('fid', 'frechet_lpips_alex')
+    >>> distance_names("inception"), distance_names("alexnet")
+    (('fid', 'kid'), ('frechet_alexnet', 'kernel_alexnet'))
     """
-    return "fid" if extractor == INCEPTION else f"frechet_{extractor}"
-
-
-def kernel_name(extractor: str) -> str:
-    """The name in records of the kernel distance of an extractor's features: "kid" only for Inception.
-
-    >>> kernel_name("inception"), kernel_name("lpips_alex")
-    ('kid', 'kernel_lpips_alex')
-    """
-    return "kid" if extractor == INCEPTION else f"kernel_{extractor}"
+    return ("fid", "kid") if extractor == INCEPTION else (f"frechet_{extractor}", f"kernel_{extractor}")
 
 
 def frechet_distance(first: Float[np.ndarray, "n d"], second: Float[np.ndarray, "m d"]) -> float:

@@ -63,19 +63,6 @@ def psnr_on_device(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"])
     return (-10 * _mse(image, truth).log10()).clamp(max=PSNR_CAP)
 
 
-def masked_psnr(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], mask: Bool[Tensor, "h w"]
-) -> float | None:
-    """PSNR of the masked pixels, dB; None if the mask is empty.
-
-    >>> image, mask = torch.tensor([[[0.0] * 3, [1.0] * 3]]), torch.tensor([[False, True]])
-    >>> masked_psnr(image, torch.zeros(1, 2, 3), mask), psnr(image, torch.zeros(1, 2, 3))
-    (-0.0, 3.0...)
-    """
-    error = masked_mse(image, truth, mask)
-    return None if error is None else psnr_of_mse(error)
-
-
 def rounded(image: Float[Tensor, "h w 3"]) -> Float[Tensor, "h w 3"]:
     """The image rounded to 8 bits; values stay in [0, 1].
 
@@ -195,31 +182,6 @@ def masked_ssim_of_map(similarity: Float64[Tensor, "h w 3"], mask: Bool[Tensor, 
     """
     check_mask(mask, similarity)
     return float(similarity[mask].mean()) if bool(mask.any()) else None
-
-
-def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], window: Window = UNIFORM7) -> float:
-    """Structural similarity of the image; 1 for identical ones. Raises ValueError for images below the window.
-
-    >>> image = torch.linspace(0, 1, 8)[:, None, None].expand(8, 8, 3)
-    >>> ssim(image, image), ssim(image, 1 - image) < 0  # the negative: covariances change their sign
-    (1.0, True)
-    """
-    return ssim_of_map(ssim_map(image, truth, window), window)
-
-
-def masked_ssim(
-    image: Float[Tensor, "h w 3"],
-    truth: Float[Tensor, "h w 3"],
-    mask: Bool[Tensor, "h w"],
-    window: Window = UNIFORM7,
-) -> float | None:
-    """Structural similarity of the full image, averaged over the masked pixels; None if the mask is empty.
-
-    >>> image, mask = torch.zeros(8, 8, 3), torch.zeros(8, 8, dtype=torch.bool)
-    >>> print(masked_ssim(image, image, mask))
-    None
-    """
-    return masked_ssim_of_map(ssim_map(image, truth, window), mask)
 
 
 def _window_means(stack: Float64[Tensor, "k c h w"], window: Window) -> Float64[Tensor, "k c h w"]:

@@ -15,7 +15,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from sparsestreet.metrics.definitions import LPIPS_SIDES
-from sparsestreet.metrics.distances import Extractor, frechet_distance, frechet_name, kernel_distance, kernel_name
+from sparsestreet.metrics.distances import Extractor, distance_names, frechet_distance, kernel_distance
 from sparsestreet.metrics.image import (
     GAUSS11,
     UNIFORM7,
@@ -30,6 +30,8 @@ from sparsestreet.metrics.image import (
 )
 from sparsestreet.metrics.lpips import Lpips, lpips_of_layers, masked_lpips_of_layers
 
+Image = Float[Tensor, "h w 3"]
+"""In [0, 1]."""
 Masks = Mapping[str, Bool[Tensor, "h w"]]
 """Region -> its pixels; the region "full" needs none."""
 
@@ -47,31 +49,23 @@ class ImageMetric(Metric):
     """Pixels; smaller images have no value."""
 
     def __init__(self, regions: Sequence[str] = ("full",), **options: Any) -> None:
-        """
-        Args:
-            regions: whose means ``compute`` returns.
-            options: of ``torchmetrics.Metric``, such as ``sync_on_compute``.
-        """
+        """``regions``: whose means ``compute`` returns; ``options``: of ``Metric``, such as ``sync_on_compute``."""
         super().__init__(**options)
         self.set_dtype(torch.float64)
         self.regions = tuple(regions)
         for region in self.regions:
             self.add_state(f"values_{region}", [], dist_reduce_fx="cat")
 
-    def measure(
-        self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks
-    ) -> dict[str, float | None]:
+    def measure(self, image: Image, truth: Image, masks: Masks) -> dict[str, float | None]:
         """Return the value of one image for "full" and each mask; None for an empty mask or a small image."""
         if min(image.shape[:2]) < self.min_side:
             return dict.fromkeys(("full", *masks))
         return self._measure(image, truth, masks)
 
     @abstractmethod
-    def _measure(
-        self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks
-    ) -> dict[str, float | None]: ...
+    def _measure(self, image: Image, truth: Image, masks: Masks) -> dict[str, float | None]: ...
 
-    def update(self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks | None = None) -> None:
+    def update(self, image: Image, truth: Image, masks: Masks | None = None) -> None:
         """Add an image to the means of the regions that it has."""
         for region, value in self.measure(image, truth, masks or {}).items():
             if value is not None and region in self.regions:
@@ -93,18 +87,11 @@ class Psnr(ImageMetric):
     higher_is_better = True
 
     def __init__(self, regions: Sequence[str] = ("full",), *, eight_bits: bool = False, **options: Any) -> None:
-        """
-        Args:
-            regions: as in ``ImageMetric``.
-            eight_bits: whether the image is rounded to 8 bits first.
-            options: as in ``ImageMetric``.
-        """
+        """``eight_bits``: whether the image is rounded to 8 bits first; all else as in ``ImageMetric``."""
         super().__init__(regions, **options)
         self.eight_bits = eight_bits
 
-    def _measure(
-        self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks
-    ) -> dict[str, float | None]:
+    def _measure(self, image: Image, truth: Image, masks: Masks) -> dict[str, float | None]:
         errors = errors_by_region(rounded(image) if self.eight_bits else image, truth, masks)
         return {region: None if error is None else psnr_of_mse(error) for region, error in errors.items()}
 
@@ -115,19 +102,12 @@ class Ssim(ImageMetric):
     higher_is_better = True
 
     def __init__(self, regions: Sequence[str] = ("full",), *, window: Window = UNIFORM7, **options: Any) -> None:
-        """
-        Args:
-            regions: as in ``ImageMetric``.
-            window: ``UNIFORM7``, or ``GAUSS11``, for which small images have no value.
-            options: as in ``ImageMetric``.
-        """
+        """``window``: ``UNIFORM7``, or ``GAUSS11``, for which small images have no value; else as ``ImageMetric``."""
         super().__init__(regions, **options)
         self.window = window
         self.min_side = window.side if window is GAUSS11 else 1
 
-    def _measure(
-        self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks
-    ) -> dict[str, float | None]:
+    def _measure(self, image: Image, truth: Image, masks: Masks) -> dict[str, float | None]:
         similarity = ssim_map(image, truth, self.window)
         regions = {region: masked_ssim_of_map(similarity, mask) for region, mask in masks.items()}
         return {"full": ssim_of_map(similarity, self.window), **regions}
@@ -151,9 +131,7 @@ class PerceptualDistance(ImageMetric):
         super().__init__(regions, **options)
         self.network, self.min_side = network, min_side
 
-    def _measure(
-        self, image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks
-    ) -> dict[str, float | None]:
+    def _measure(self, image: Image, truth: Image, masks: Masks) -> dict[str, float | None]:
         layers = self.network.layer_maps(image, truth)
         regions = {region: masked_lpips_of_layers(layers, mask) for region, mask in masks.items()}
         return {"full": lpips_of_layers(layers), **regions}
@@ -170,18 +148,14 @@ class SetDistances(Metric):
     higher_is_better = False
 
     def __init__(self, extractor: Extractor, **options: Any) -> None:
-        """
-        Args:
-            extractor: computes an image's features.
-            options: of ``torchmetrics.Metric``.
-        """
+        """``extractor``: computes an image's features; ``options``: of ``torchmetrics.Metric``."""
         super().__init__(**options)
         self.set_dtype(torch.float64)
         self.extractor = extractor
         for name in ("real", "rendered"):
             self.add_state(name, [], dist_reduce_fx="cat")
 
-    def update(self, image: Float[Tensor, "h w 3"], *, real: bool) -> None:
+    def update(self, image: Image, *, real: bool) -> None:
         """Add an image in [0, 1] to the real or to the rendered ones."""
         features = torch.from_numpy(self.extractor(image)).to(self.device)
         (self.real if real else self.rendered).append(features[None])  # pyright: ignore
@@ -189,11 +163,8 @@ class SetDistances(Metric):
     def compute(self) -> dict[str, float]:
         """Return each distance by its name in records. Raises ValueError for fewer than two images in a set."""
         rendered, real = (_rows(state).cpu().numpy() for state in (self.rendered, self.real))
-        name = self.extractor.name
-        return {
-            frechet_name(name): frechet_distance(rendered, real),
-            kernel_name(name): kernel_distance(rendered, real),
-        }
+        frechet, kernel = distance_names(self.extractor.name)
+        return {frechet: frechet_distance(rendered, real), kernel: kernel_distance(rendered, real)}
 
     def reset(self) -> None:
         """Forget the rendered images."""
@@ -208,9 +179,7 @@ def _rows(state: Any) -> Float[Tensor, "n d"] | Float64[Tensor, "0 0"]:
     return torch.cat(state) if state else torch.zeros(0, 0, dtype=torch.float64)
 
 
-def errors_by_region(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], masks: Masks
-) -> dict[str, float | None]:
+def errors_by_region(image: Image, truth: Image, masks: Masks) -> dict[str, float | None]:
     """Return the mean squared error of the full image and of each mask; None where a mask is empty.
 
     >>> image, mask = torch.full((2, 2, 3), 0.5), torch.zeros(2, 2, dtype=torch.bool)

@@ -11,7 +11,6 @@ from sparsestreet.pruning.importance import (
     MiniSplattingRule,
     OpacityRule,
     RandomRule,
-    measure_importance,
 )
 from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
 from sparsestreet.pruning.select import (
@@ -39,5 +38,4 @@ __all__ = [
     "keep_by_cost",
     "keep_by_importance",
     "keep_by_rank",
-    "measure_importance",
 ]

@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -82,33 +82,26 @@ class Importance:
         return ranks.sum(self._total.clone()) / ranks.sum(torch.tensor(self.views, device=self._total.device))
 
 
-def measure_importance(views: Iterable[Contribution], gate: bool = True) -> Float64[Tensor, " n"]:
-    """Return the scores of all rows over all views; see ``Importance`` for the formula and the errors raised.
+@dataclass(frozen=True)
+class _NumberRule(PruningRule):
+    """Keeps a given number of each node's rows, those with the highest scores, or more if a floor demands it."""
 
-    >>> view = Contribution(torch.tensor([3.0, 1.0]).double(), torch.tensor([4, 4]), torch.tensor([4, 0]))
-    >>> measure_importance([view], gate=False).tolist()
-    [0.75, 0.25]
-    """
-    importance = Importance(gate)
-    for view in views:
-        importance.add(view)
-    return importance.scores()
+    keep: Keep
+    """How many rows stay (see ``select.Keep``)."""
+
+    def __post_init__(self) -> None:
+        check_keep(self.keep)
 
 
 @dataclass(frozen=True)
-class WeightRule(PruningRule):
-    """Keeps a given number of each node's rows by the sum of their blend weights alpha * transmittance over all views.
+class WeightRule(_NumberRule):
+    """Scores rows by the sum of their blend weights alpha * transmittance over all views.
 
     The weights come from renders of the whole scene.
     """
 
-    keep: Keep
-    """How many rows stay (see ``counts.Keep``)."""
     gate: bool = False
     """Whether a view counts only for rows that are the largest contributor of one of its pixels."""
-
-    def __post_init__(self) -> None:
-        check_keep(self.keep)
 
     @abstractmethod
     def scores(self, name: str, rows: Rows, weights: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
@@ -180,14 +173,8 @@ class LightGaussianRule(WeightRule):
 
 
 @dataclass(frozen=True)
-class CountRule(PruningRule):
-    """Keeps a given number of each node's rows, those with the highest scores, or more if a floor demands it."""
-
-    keep: Keep
-    """How many rows stay (see ``counts.Keep``)."""
-
-    def __post_init__(self) -> None:
-        check_keep(self.keep)
+class CountRule(_NumberRule):
+    """Scores rows without a look at any image."""
 
     @abstractmethod
     def scores(self, name: str, rows: Rows) -> Float[Tensor, " n"]:

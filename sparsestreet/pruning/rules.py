@@ -45,7 +45,7 @@ class ImportanceRule(PruningRule):
     """For comparisons at equal count: the rule removes this many rows instead, the least important of all its nodes
     together. A value up to 1 is a fraction of the rows of the whole scene; a larger one is a number of rows."""
     keep: Keep | None = None
-    """For comparisons at equal count, node by node: the most important rows of each node stay (see ``counts.Keep``)."""
+    """For comparisons at equal count, node by node: the most important rows of each node stay (see ``select.Keep``)."""
 
     def __post_init__(self) -> None:
         if self.remove is not None and not self.remove >= 0:
@@ -99,7 +99,7 @@ class LeaveOneOutRule(PruningRule):
     """One step of an 8-bit image; 0: every change counts."""
     keep: Keep | None = None
     """For comparisons at equal count, node by node: the most expensive rows of each node stay instead, whatever that
-    costs (see ``counts.Keep``)."""
+    costs (see ``select.Keep``)."""
     beside: float | None = None
     """Meters; None: only recorded views count. Scoring takes twice the time."""
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.data.frame_cache import to_device
@@ -187,10 +187,7 @@ def keep_by_cost(
     everything = torch.cat([cost.double() for cost in costs.values()])
     if not (everything >= 0).all():
         raise ValueError(f"costs of removal must be numbers >= 0, got {float(everything[~(everything >= 0)][0])}")
-    order = _lowest_first(everything)
-    unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
-    unwanted[order] = everything[order].cumsum(0) <= allowed
-    return _keep_in_each(costs, unwanted, floors)
+    return keep_by_rank(costs, int((everything.sort().values.cumsum(0) <= allowed).sum()), floors)
 
 
 def keep_by_rank(
@@ -209,20 +206,10 @@ def keep_by_rank(
             f"{number:,} rows are to go, and the nodes that the rule may take from have {len(everything):,}: take "
             "fewer, or let it take from more nodes"
         )
+    # Among equals the later row goes first, as at the floors.
+    lowest_first = len(everything) - 1 - torch.sort(everything.flip(0), stable=True).indices
     unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
-    unwanted[_lowest_first(everything)[:number]] = True
-    return _keep_in_each(scores, unwanted, floors)
-
-
-def _lowest_first(values: Float[Tensor, " n"]) -> Int64[Tensor, " n"]:
-    """Return rows in order of their values; among equals the later row comes first, as at the floors."""
-    return len(values) - 1 - torch.sort(values.flip(0), stable=True).indices
-
-
-def _keep_in_each(
-    scores: Mapping[str, Float[Tensor, " _"]], unwanted: Bool[Tensor, " n"], floors: Mapping[str, Floors]
-) -> dict[str, Selection]:
-    """Return the rows that stay of each node; ``unwanted`` marks the rows of all nodes one after the other."""
+    unwanted[lowest_first[:number]] = True
     parts = unwanted.split([len(score) for score in scores.values()])
     return {name: keep_best(scores[name], part, *floors[name]) for name, part in zip(scores, parts, strict=True)}
 

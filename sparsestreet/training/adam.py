@@ -1,6 +1,6 @@
 """Adam that leaves a row alone whose gradient is not finite; and one that steps only what the step's view has seen."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,24 +19,8 @@ class RefusedRows:
     """What a step refused: of each parameter with a gradient the number of rows, and the first of them."""
 
     parameters: tuple[Tensor, ...]
-    groups: tuple[Mapping[str, Any], ...]
     counts: Tensor
     """int64 [parameters, 2], on the device of the parameters."""
-
-    @staticmethod
-    def of(groups: Iterable[Mapping[str, Any]]) -> "RefusedRows":
-        """Count of zero for the parameters that have a gradient."""
-        held = [(one, group) for group in groups for one in group["params"] if one.grad is not None]
-        device = held[0][0].device if held else torch.device("cpu")
-        counts = torch.zeros(len(held), 2, dtype=torch.int64, device=device)
-        counts[:, 1] = NONE
-        return RefusedRows(tuple(one for one, _ in held), tuple(group for _, group in held), counts)
-
-    def places(self) -> Iterator[tuple[Tensor, Tensor, Mapping[str, Any], Tensor]]:
-        """Parameter, gradient, group and counts."""
-        for parameter, group, counts in zip(self.parameters, self.groups, self.counts, strict=True):
-            assert parameter.grad is not None  # such parameters alone are held
-            yield parameter, parameter.grad, group, counts
 
 
 class RowAdam(torch.optim.Adam):
@@ -68,15 +52,19 @@ class RowAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        self.refused = RefusedRows.of(self.param_groups)
-        for parameter, gradient, group, counts in self.refused.places():
+        held = [(one, group) for group in self.param_groups for one in group["params"] if one.grad is not None]
+        device = held[0][0].device if held else torch.device("cpu")
+        counts = torch.zeros(len(held), 2, dtype=torch.int64, device=device)
+        counts[:, 1] = NONE
+        self.refused = RefusedRows(tuple(one for one, _ in held), counts)
+        for (parameter, group), refused in zip(held, counts, strict=True):
             state = self.state[parameter]
             if not state:
                 state["step"] = torch.zeros((), dtype=torch.float32)
                 state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
             state["step"] += 1
             step = AdamStep(int(state["step"]), group["lr"], tuple(group["betas"]), group["eps"])
-            self._update(parameter, gradient, (state["exp_avg"], state["exp_avg_sq"]), counts, step)
+            self._update(parameter, parameter.grad, (state["exp_avg"], state["exp_avg_sq"]), refused, step)
         return loss
 
     def _update(

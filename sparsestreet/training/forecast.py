@@ -1,7 +1,6 @@
 """What a training will need and what it cost: memory, seconds, curves."""
 
 import logging
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +15,7 @@ from sparsestreet.data.frame_cache import to_device
 from sparsestreet.data.lazy import spread
 from sparsestreet.evaluation.evaluate import evaluate_frames, screen_image
 from sparsestreet.evaluation.speed import Timing, peak_megabytes
-from sparsestreet.phases import StageRecorder
+from sparsestreet.phases import StageRecorder, clock_of
 from sparsestreet.records.costs import stage_costs, step_costs, update_costs
 from sparsestreet.records.curves import LOGGED, Logged, LoggedFile
 from sparsestreet.scene.gaussians import Rows
@@ -142,16 +141,10 @@ def _step(system: StreetSystem, frame: Frame) -> None:
 
 
 def _seconds(work: Callable[[], object], device: torch.device) -> float:
-    _wait(device)
-    started = time.perf_counter()
+    clock = clock_of(device)
+    started = clock.mark()
     work()
-    _wait(device)
-    return time.perf_counter() - started
-
-
-def _wait(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    return clock.seconds(started, clock.mark())
 
 
 log = logging.getLogger(__name__)

@@ -14,23 +14,12 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
-__all__ = [
-    "Depth",
-    "DynamicRegion",
-    "InverseDepthSmoothness",
-    "Loss",
-    "MaskSparsity",
-    "OpacityEntropy",
-    "Photometric",
-    "SkyMask",
-]
-
 
 @runtime_checkable
 class Loss(Protocol):
     def applies(self, frame: Frame) -> bool:
         """Whether the frame carries what the term compares with."""
-        ...
+        return True
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         """The weighted term."""
@@ -38,14 +27,11 @@ class Loss(Protocol):
 
 
 @dataclass(frozen=True)
-class Photometric:
+class Photometric(Loss):
     """On unclamped colors: a clamp would stop the gradient of saturated pixels (lamps, white sky)."""
 
     weight: float = 1.0
     lambda_dssim: float = 0.2
-
-    def applies(self, frame: Frame) -> bool:
-        return True
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         truth = frame.image.to(rendering.rgb.dtype) / 255
@@ -80,7 +66,7 @@ def without_hood(rendering: SceneRendering, frame: Frame) -> tuple[SceneRenderin
 
 
 @dataclass(frozen=True)
-class SkyMask:
+class SkyMask(Loss):
     """Mean over the pixels of a cross entropy that is finite, and pulls, at every alpha.
 
     With a = alpha, y = 0 in the sky and 1 elsewhere::
@@ -120,7 +106,7 @@ class SkyMask:
 
 
 @dataclass(frozen=True)
-class Depth:
+class Depth(Loss):
     """The inverse depth bounds the pull of far and wrong returns (DriveStudio's paper_legacy configurations)."""
 
     weight: float = 0.1
@@ -147,7 +133,7 @@ class Depth:
 
 
 @dataclass(frozen=True)
-class DynamicRegion:
+class DynamicRegion(Loss):
     """Mean |I - truth| once more over the pixels that objects cover: where they, rendered alone, have enough alpha.
 
     Objects are what nodes with ``instances`` hold. What stands in front of them does not count: a hidden object has its
@@ -160,9 +146,6 @@ class DynamicRegion:
     """Alpha of the objects above which a pixel belongs to the region."""
     from_progress: float = 0.6666
     """Fraction of the run before which the term rests."""
-
-    def applies(self, frame: Frame) -> bool:
-        return True
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         objects = [rendering.parts[name] for name, node in scene.nodes.items() if node.instances() is not None]
@@ -186,7 +169,7 @@ MIN_DEPTH = 1e-5
 
 
 @dataclass(frozen=True)
-class InverseDepthSmoothness:
+class InverseDepthSmoothness(Loss):
     """mean(|dx d| exp(-|dx I|)) + mean(|dy d| exp(-|dy I|)) of the inverse depth d; |I| is the mean of the channels.
 
     Steps between neighbors of which one shows nothing (depth 0) count as none: an inverse depth of 10^5 would stand
@@ -194,9 +177,6 @@ class InverseDepthSmoothness:
     """
 
     weight: float = 0.001
-
-    def applies(self, frame: Frame) -> bool:
-        return True
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         truth = frame.image.to(rendering.depth.dtype) / 255
@@ -210,15 +190,12 @@ class InverseDepthSmoothness:
 
 
 @dataclass(frozen=True)
-class MaskSparsity:
+class MaskSparsity(Loss):
     """K counts all Gaussians of all nodes, masked nodes or not; lambda_n is the ``sparsity_weight`` of the node's own
     mask."""
 
     weight: float = 1.0
     """lambda_m."""
-
-    def applies(self, frame: Frame) -> bool:
-        return True
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         rows = max(sum(scene.counts().values()), 1)
@@ -231,7 +208,7 @@ class MaskSparsity:
 
 
 @dataclass(frozen=True)
-class OpacityEntropy:
+class OpacityEntropy(Loss):
     """Mean over the pixels of -a log((a + eps) / (1 + eps)): 0 at both ends, with a finite slope at each.
 
     -a log a itself is infinitely steep where nothing is drawn. Raises ValueError for an ``eps`` that is not positive.
@@ -243,9 +220,6 @@ class OpacityEntropy:
     def __post_init__(self) -> None:
         if not self.eps > 0:
             raise ValueError(f"the entropy has a finite slope at alpha 0 for eps > 0 only, got {self.eps}")
-
-    def applies(self, frame: Frame) -> bool:
-        return True
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         alpha = rendering.alpha

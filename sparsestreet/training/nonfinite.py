@@ -24,11 +24,30 @@ class NotFiniteError(ValueError):
     """A loss, a gradient or a parameter is NaN or infinite: training cannot go on from it."""
 
 
-class LossWatch:
-    """Looks at the terms of each loss: in the step itself on the CPU, one step later on a device."""
+class _Watch:
+    """Looks at numbers: in the step itself on the CPU, one step later on a device."""
 
     def __init__(self) -> None:
-        self._pending: tuple[HostCopy, tuple[str, ...], SceneGraph, View, int] | None = None
+        self._pending: tuple[HostCopy, tuple[Any, ...]] | None = None
+
+    def settle(self) -> None:
+        """Look at what has not been looked at yet; this may wait. Raises NotFiniteError."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            numbers, known = pending
+            self._judge(numbers.wait(), *known)
+
+    def _keep(self, numbers: Tensor, *known: Any) -> None:
+        self._pending = copy_to_host(numbers), known
+        if numbers.device.type == "cpu":
+            self.settle()
+
+    def _judge(self, numbers: Tensor, *known: Any) -> None:
+        raise NotImplementedError
+
+
+class LossWatch(_Watch):
+    """Looks at the terms of each loss."""
 
     def look(self, names: Iterable[str], terms: Tensor, scene: SceneGraph, view: View, step: int) -> None:
         """Before anything is learned from the ``step``-th step. Raises NotFiniteError, on a device for the step before.
@@ -42,19 +61,10 @@ class LossWatch:
         """
         self.settle()
         # One number is looked at in a step whose loss is finite.
-        on_host = terms.device.type == "cpu"
-        if not on_host or not bool(terms.detach().sum().isfinite()):
-            self._pending = (copy_to_host(terms.detach()), tuple(names), scene, view, step)
-        if on_host:
-            self.settle()
+        if terms.device.type != "cpu" or not bool(terms.detach().sum().isfinite()):
+            self._keep(terms.detach(), tuple(names), scene, view, step)
 
-    def settle(self) -> None:
-        """Look at what has not been looked at yet; this may wait. Raises NotFiniteError."""
-        pending, self._pending = self._pending, None
-        if pending is None:
-            return
-        terms, names, scene, view, step = pending
-        values = terms.wait()
+    def _judge(self, values: Tensor, names: tuple[str, ...], scene: SceneGraph, view: View, step: int) -> None:
         if bool(values.sum().isfinite()):
             return
         wrong = [f"{name} = {value:g}" for name, value in zip(names, values.tolist(), strict=True)
@@ -162,61 +172,43 @@ FEW = 10
 """Rows that may always rest: in a node of 50 Gaussians half a one would be the share."""
 
 
-@dataclass(frozen=True)
-class _Look:
-    """At the rows that a step refused."""
-
-    counts: HostCopy
-    names: tuple[str, ...]
-    rows: tuple[int, ...]
-    view: View
-    step: int
-
-
-class Quarantine:
-    """Looks at what an optimizer refused: in the step itself on the CPU, one step later on a device.
+class Quarantine(_Watch):
+    """Looks at what an optimizer refused.
 
     A row of a node rests for that step, and training goes on. It ends where more than ``SHARE`` of a column's rows (and
     more than ``FEW``) are refused in one step, or anything of a parameter that is no row of a node.
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.counts: dict[str, int] = {}
         """Node and column -> how often a row of it rested, over all steps."""
         self._ids: tuple[int, ...] = ()
         self._names: tuple[str, ...] = ()
-        self._pending: _Look | None = None
 
     def look(self, refused: RefusedRows, named: Iterable[tuple[str, Tensor]], view: View, step: int) -> None:
         """After a step on ``view``, the ``step``-th. Raises NotFiniteError, on a device for the step before."""
-        on_host = refused.counts.device.type == "cpu"
         self.settle()
-        if on_host and not bool(refused.counts[:, 0].any()):
+        if refused.counts.device.type == "cpu" and not bool(refused.counts[:, 0].any()):
             return
         ids = tuple(map(id, refused.parameters))
         if ids != self._ids:  # rows that change are new parameters
             by_id = {id(parameter): name for name, parameter in named}
             self._ids, self._names = ids, tuple(by_id.get(one, "a parameter") for one in ids)
         rows = tuple(len(one) if one.dim() else 1 for one in refused.parameters)
-        self._pending = _Look(copy_to_host(refused.counts), self._names, rows, view, step)
-        if on_host:
-            self.settle()
+        self._keep(refused.counts, self._names, rows, view, step)
 
-    def settle(self) -> None:
-        """Look at what has not been looked at yet; this may wait. Raises NotFiniteError."""
-        look, self._pending = self._pending, None
-        if look is None:
-            return
+    def _judge(self, counts: Tensor, names: tuple[str, ...], lengths: tuple[int, ...], view: View, step: int) -> None:
         found = [
             (name, rows, count, first)
-            for name, rows, (count, first) in zip(look.names, look.rows, look.counts.wait().tolist(), strict=True)
+            for name, rows, (count, first) in zip(names, lengths, counts.tolist(), strict=True)
             if count
         ]
         if not found:
             return
         places = [f"{name} row {first:,} ({count:,} of {rows:,} rows)" for name, rows, count, first in found]
         said = ", ".join(places[:_NAMED])
-        where = f"step {look.step}, {seen_from(look.view)}"
+        where = f"step {step}, {seen_from(view)}"
         if any(not _is_row(name) or count > max(SHARE * rows, FEW) for name, rows, count, _ in found):
             raise NotFiniteError(
                 f"{where}: gradients are not finite: {said}. Single rows of a node would rest for the step; these are "

@@ -65,7 +65,8 @@ class Recipe:
                     "Pruning is among the callbacks but its rule may touch no node: set node.X.prunable=true, or the "
                     "rule's nodes to null"
                 )
-        if self._has(DensityControl) and all(settings.density is None for settings in self.nodes.values()):
+        controlled = any(isinstance(callback, DensityControl) for callback in self.callbacks.values())
+        if controlled and all(settings.density is None for settings in self.nodes.values()):
             found.append("DensityControl is among the callbacks but every node's density is null: leave it out")
         if shared := self.nodes.keys() & self.effects.keys():
             found.append(f"a node and an effect are both named {', '.join(sorted(shared))}: rename one of them")
@@ -121,9 +122,6 @@ class Recipe:
             if self.moved_views is None
             else moved_view_term(self.moved_views, data, self.nodes, self.seed),
         )
-
-    def _has(self, kind: type[Callback]) -> bool:
-        return any(isinstance(callback, kind) for callback in self.callbacks.values())
 
 
 def _training_data(data: StreetData) -> TrainingData:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import statistics
-import weakref
 from typing import Any
 
 import numpy as np
@@ -207,21 +206,6 @@ def test_the_scene_is_what_is_compared():
         assert quality.value("psnr", "full") > 50  # 8 bits: at worst 54.2 dB away, half a level everywhere
     (quality,) = evaluate_frames(SCENE, [seen], OPTIONS)
     assert quality.value("psnr", "full") < 50
-
-
-@pytest.mark.usefixtures("noise")
-def test_frames_are_let_go_one_by_one():
-    alive = []
-
-    def stream():
-        for index in range(4):
-            assert sum(reference() is not None for reference in alive) <= 1
-            frame = make_frame(index)
-            alive.append(weakref.ref(frame))
-            yield frame
-            del frame
-
-    assert len(list(evaluate_frames(SCENE, stream(), OPTIONS))) == 4
 
 
 @pytest.mark.usefixtures("noise")

@@ -18,21 +18,23 @@ from tests.evaluation.frames import NOISE, make_frame
 from tests.evaluation.scenes import OPTIONS, small_scene
 
 
+def street(count=4, stride=2, **changes):
+    """Of so many instants the second and fourth are held out, or none."""
+    frames = tuple(make_frame(index) for index in range(count))
+    log = DrivingLog("some", as_frames(frames), Sweeps.of(()), (), count, 1, torch.eye(4).double(), **changes)
+    return StreetData(log, stride=stride, offset=1)
+
+
 @pytest.mark.lengthy
 @pytest.mark.parametrize(("stride", "views", "ramp"), [(2, 1, True), (0, 3, False)])
 def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_none(
     monkeypatch, tmp_path, stride, views, ramp
 ):
-    """Of three instants the second is held out, or none."""
     monkeypatch.setattr(extra, "open_lpips", lambda device: ({}, {"lpips_alex": "no weights"}))
-    frames = tuple(make_frame(index) for index in range(3))
-    data = StreetData(
-        DrivingLog("three", as_frames(frames), Sweeps.of(()), (), 3, 1, torch.eye(4).double()), stride=stride, offset=1
-    )
     (tmp_path / "records").mkdir()
     said = []
     asked = ExtraMetrics(novel=(1.0,), ramp=ramp, presets=("fast",))
-    asked.measure(small_scene(), data, OPTIONS, out=tmp_path, command="c", say=said.append)
+    asked.measure(small_scene(), street(3, stride), OPTIONS, out=tmp_path, command="c", say=said.append)
     beside = NOVEL.read(tmp_path)
     assert (beside.real_views, beside.ramp) == (views, ramp)
     assert PRESETS.read(tmp_path).views == views
@@ -48,13 +50,6 @@ def test_what_is_said_of_a_side():
     record = NovelRecord(command="c", ramp=False, real_views=6, absent=None, shifts=tuple(shifts))
     said = [f"2 m to the {side} (n=6): fid 42, 20.00 dB to the truth" for side in ("right", "left")]
     assert list(_of_shifts(record)) == said
-
-
-def street(count=4, **changes):
-    """Of so many instants the second and fourth are held out."""
-    frames = tuple(make_frame(index) for index in range(count))
-    log = DrivingLog("some", as_frames(frames), Sweeps.of(()), (), count, 1, torch.eye(4).double(), **changes)
-    return StreetData(log, stride=2, offset=1)
 
 
 NETWORK = object()

@@ -12,7 +12,6 @@ from sparsestreet.evaluation.evaluate import screen_image
 from sparsestreet.evaluation.extra import evaluate_novel, shifted_views
 from sparsestreet.metrics.distances import frechet_distance, kernel_distance
 from sparsestreet.metrics.lpips import Lpips
-from sparsestreet.records.summary import NOVEL
 from sparsestreet.types import Frame
 from tests.evaluation.frames import make_frame
 from tests.evaluation.scenes import OPTIONS, replace_render, small_scene
@@ -161,11 +160,3 @@ def count_live(monkeypatch):
 
     monkeypatch.setattr(novel_module, "screen_image", counted)
     return seen
-
-
-def test_novel_round_trip(tmp_path):
-    record = dataclasses.replace(evaluate(rig(2), ramp=True), absent="none here")
-    NOVEL.write(tmp_path, record)
-    assert NOVEL.path(tmp_path) == tmp_path / "records" / "novel.json"
-    assert NOVEL.read(tmp_path) == record
-    assert record.ramp

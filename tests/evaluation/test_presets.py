@@ -12,8 +12,6 @@ from sparsestreet.evaluation import extra as presets_module
 from sparsestreet.evaluation.evaluate import evaluate_frames
 from sparsestreet.evaluation.extra import ROUNDS, evaluate_presets
 from sparsestreet.ops import SplatSettings
-from sparsestreet.records.strict_json import RecordError
-from sparsestreet.records.summary import PRESETS
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, render
 from tests.evaluation.frames import make_frame
@@ -79,17 +77,6 @@ def test_exact_goes_on_behind_what_is_all_but_opaque():
 def test_what_is_slow_is_timed_once_a_view(monkeypatch):
     monkeypatch.setattr(presets_module, "SLOW_MS", 0.0)
     assert evaluated({"default": RenderOptions()}).rendered[0].repeats == 2
-
-
-def test_a_record_is_read_back(tmp_path):
-    record = evaluated({"default": RenderOptions()})
-    path = PRESETS.path(tmp_path)
-    PRESETS.write(tmp_path, record)
-    again = PRESETS.read(tmp_path)
-    assert again.rendered[0].psnr_to_exact == pytest.approx(record.rendered[0].psnr_to_exact, rel=1e-5)
-    path.write_text(path.read_text().replace("psnr_to_exact", "psnr_to_nothing"))
-    with pytest.raises(RecordError, match=r"presets\.json"):
-        PRESETS.read(tmp_path)
 
 
 def test_without_presets_there_is_nothing_to_measure():

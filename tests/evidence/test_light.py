@@ -65,22 +65,23 @@ def test_sky_and_car_do_not_count():
     assert measured_light(as_frames(nothing)).level == 128
 
 
-@pytest.mark.parametrize(("level", "dark"), [(118, False), (60, False), (30, True), (0, True)])
-def test_dark_images_are_doubted(level: float, dark: bool):
-    said = tuple(light_warnings(measured_light(frames(level))))
-    assert [f"10 images have a mean gray level of {level} of 255" in line for line in said] == [True] * dark
-
-
-@pytest.mark.parametrize(("white", "clipped"), [(0.0, False), (0.1, False), (0.4, True)])
-def test_clipped_images_are_doubted_and_the_worst_is_named(white: float, clipped: bool):
-    said = tuple(light_warnings(measured_light(frames(90, white=white))))
-    assert ["most in frame 9 (40.0 %)" in line for line in said] == [True] * clipped
+@pytest.mark.parametrize(
+    ("level", "white", "doubts"),
+    [
+        (60, 0.0, []),
+        (30, 0.0, ["10 images have a mean gray level of 30 of 255"]),
+        (0, 0.0, ["10 images have a mean gray level of 0 of 255"]),
+        (90, 0.1, []),
+        (90, 0.4, ["most in frame 9 (40.0 %)"]),
+    ],
+)
+def test_dark_and_clipped_images_are_doubted_and_the_worst_is_named(level: float, white: float, doubts: list[str]):
+    said = tuple(light_warnings(measured_light(frames(level, white=white))))
+    assert [doubt in line for doubt, line in zip(doubts, said, strict=True)] == [True] * len(doubts)
 
 
 def test_the_record_counts_stops():
-    numbers = measured_light(frames(59)).numbers()
-    assert numbers["stops_below_middle_gray"] == pytest.approx(1)  # half of 118
-    assert numbers["mean_gray_level"] == pytest.approx(59)
+    assert measured_light(frames(59)).numbers()["stops_below_middle_gray"] == pytest.approx(1)  # half of 118
 
 
 def frames_sky(*shares: float) -> Frames:

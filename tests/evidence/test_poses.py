@@ -135,20 +135,3 @@ def test_a_car_that_stands_says_nothing(monkeypatch: pytest.MonkeyPatch):
 
     monkeypatch.setattr(poses, "street_points", looked_at)
     assert pose_noise(as_frames(still), ()) is None
-
-
-def test_pixels_of_the_recording_car_do_not_count(monkeypatch: pytest.MonkeyPatch):
-    hood, sky = torch.zeros(2, 120, 200, dtype=torch.bool)
-    hood[100:], sky[:40] = True, True
-    image = torch.zeros(120, 200, 3, dtype=torch.uint8)
-    frame = Frame(true_camera(0, False), 0.0, 0, 0, image=image, ego=hood)
-    asked = []
-
-    def looked_at(frames: Frames, *rest: object) -> StreetPoints:
-        asked.append(frames[0].sky)
-        return seen_points(frames, False)
-
-    monkeypatch.setattr(poses, "street_points", looked_at)
-    for known, wanted in ((None, hood), (sky, hood | sky)):
-        pose_noise(as_frames([replace(frame, sky=known)]), ())
-        assert torch.equal(asked.pop(), wanted)

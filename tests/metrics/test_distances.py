@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import sqrtm
 
-from sparsestreet.metrics.distances import frechet_distance, frechet_name, kernel_distance, kernel_name
+from sparsestreet.metrics.distances import frechet_distance, kernel_distance
 
 
 def features(count, width, seed, shift=0.0):
@@ -84,8 +84,3 @@ def test_few_images(distance):
     broken[1, 2] = np.nan
     with pytest.raises(ValueError, match="finite features"):
         distance(pair, broken)
-
-
-def test_only_inceptions_distance_is_called_fid():
-    assert (frechet_name("inception"), kernel_name("inception")) == ("fid", "kid")
-    assert (frechet_name("lpips_alex"), kernel_name("lpips_alex")) == ("frechet_lpips_alex", "kernel_lpips_alex")

@@ -17,7 +17,7 @@ from torch import Tensor
 from sparsestreet.geometry.cameras import project, ray_directions
 from sparsestreet.ops import contribution, splat
 from sparsestreet.scene.gaussians import RowPlan, Rows
-from sparsestreet.types import Camera, Contribution, Gaussians
+from sparsestreet.types import Camera, Gaussians
 
 NOTICEABLE = 1 / 255
 """One step of an 8-bit image: what no screen shows is not seen."""
@@ -39,10 +39,6 @@ class Verdict:
 def judge(keep: Bool[Tensor, " n"], planted: Bool[Tensor, " n"], visible: Bool[Tensor, " n"]) -> Verdict:
     """Hold a selection against the truth; ``visible`` may mark a sample of the visible rows only."""
     num_planted, num_visible = int(planted.sum()), int(visible.sum())
-    if not num_planted or not num_visible or bool((planted & visible).any()):
-        raise ValueError(
-            f"need planted and visible rows, not both at once: {num_planted} planted, {num_visible} visible"
-        )
     return Verdict(
         float((planted & ~keep).sum()) / num_planted,
         float((visible & ~keep).sum()) / num_visible,
@@ -216,11 +212,6 @@ def _moving(views: Views, old: int) -> Bool[Tensor, " m"]:
     # others are tested one by one.
     unclear = (largest > NOTICEABLE) & (torch.arange(len(views.gaussians)) >= old)
     return views.visible(torch.nonzero(unclear).squeeze(-1))[old:]
-
-
-def contributions_of(rows: Rows, cameras: Sequence[Camera], backend: str = "auto") -> list[Contribution]:
-    """What the importance rule is fed with."""
-    return Views(activated(rows), cameras, backend).contributions
 
 
 def joint_change(rows: Rows, planted: Bool[Tensor, " n"], cameras: Sequence[Camera], backend: str) -> float:

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sparsestreet.pruning import Importance, measure_importance
+from sparsestreet.pruning import Importance
 from sparsestreet.ranks import Ranks
 from sparsestreet.types import Contribution
 
@@ -11,6 +11,13 @@ from sparsestreet.types import Contribution
 def view(weight: list[float], pixels: list[int], dominant: list[int]) -> Contribution:
     counts = torch.tensor([pixels, dominant], dtype=torch.int64)
     return Contribution(torch.tensor(weight, dtype=torch.float64), *counts)
+
+
+def scores(views: list[Contribution], gate: bool = True) -> torch.Tensor:
+    importance = Importance(gate)
+    for one in views:
+        importance.add(one)
+    return importance.scores()
 
 
 class Twins(Ranks):
@@ -34,16 +41,16 @@ def test_scores_of_a_hand_computed_case():
         view([0.25, 2.0, 0.5, 0.0], [1, 4, 1, 0], [1, 2, 0, 0]),
     ]
     gated = [(3 / 4 + 1 / 4) / 2, (0 + 2 / 4) / 2, 0.0, 0.0]
-    assert measure_importance(views, gate=True).tolist() == gated  # halves and quarters are exact
+    assert scores(views, gate=True).tolist() == gated  # halves and quarters are exact
     ungated = [gated[0], (1 / 2 + 2 / 4) / 2, pytest.approx((0.1 + 0.5) / 2, abs=1e-15), 0.0]
-    assert measure_importance(views, gate=False).tolist() == ungated
+    assert scores(views, gate=False).tolist() == ungated
 
 
 def test_sums_are_float64():
     # In float32 the small view vanishes beside the large one: 1 + 2^-30 == 1.
-    scores = measure_importance([view([1.0], [1], [1]), view([2.0**-30], [1], [1])])
-    assert scores.dtype == torch.float64
-    assert scores.item() * 2 - 1 == 2.0**-30
+    found = scores([view([1.0], [1], [1]), view([2.0**-30], [1], [1])])
+    assert found.dtype == torch.float64
+    assert found.item() * 2 - 1 == 2.0**-30
 
 
 def test_adding_a_view_does_not_change_earlier_scores():
@@ -56,20 +63,20 @@ def test_adding_a_view_does_not_change_earlier_scores():
 
 
 def test_a_scene_without_rows_scores_nothing():
-    assert measure_importance([view([], [], [])]).shape == (0,)
+    assert scores([view([], [], [])]).shape == (0,)
 
 
 def test_no_view_is_an_error_not_a_zero_score():
     with pytest.raises(ValueError, match="at least one view"):
-        measure_importance([])
+        scores([])
 
 
 def test_views_of_other_rows_are_refused():
     with pytest.raises(ValueError, match="view 1 has 1 and those before 2"):
-        measure_importance([view([1.0, 1.0], [1, 1], [1, 1]), view([1.0], [1], [1])])
+        scores([view([1.0, 1.0], [1, 1], [1, 1]), view([1.0], [1], [1])])
 
 
 @pytest.mark.parametrize("poison", [float("nan"), float("inf"), -0.5])
 def test_poisoned_weights_are_refused(poison):
     with pytest.raises(ValueError, match="row 1 of view 0"):
-        measure_importance([view([1.0, poison], [1, 1], [1, 1])])
+        scores([view([1.0, poison], [1, 1], [1, 1])])

@@ -8,10 +8,11 @@ import torch
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
 from sparsestreet.ops import splat
-from sparsestreet.pruning import Floors, keep_by_importance, measure_importance
+from sparsestreet.pruning import Floors, keep_by_importance
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.types import Camera
-from tests.pruning.planted import NOTICEABLE, Views, activated, contributions_of, joint_change, judge, plant
+from tests.pruning.planted import NOTICEABLE, Views, activated, joint_change, judge, plant
+from tests.pruning.test_importance import scores
 from tests.scene.street import static_mask
 
 pytestmark = pytest.mark.lengthy
@@ -89,8 +90,8 @@ def test_planted_rows_are_useless_and_keep_the_others(planted_wall):
 def test_zero_importance_removes_what_was_planted_and_nothing_visible(planted_wall):
     rows, planted = planted_wall
     visible = Views(activated(rows), cameras(), BACKEND).visible(torch.nonzero(~planted).squeeze(-1))
-    scores = measure_importance(contributions_of(rows, cameras(), BACKEND))
-    verdict = judge(keep_by_importance(scores, Floors(0)).keep, planted, visible)
+    found = scores(Views(activated(rows), cameras(), BACKEND).contributions)
+    verdict = judge(keep_by_importance(found, Floors(0)).keep, planted, visible)
     assert verdict.num_visible == 49  # every tile and the front of the slab
     assert verdict.recall >= RECALL
     assert verdict.visible_lost <= VISIBLE_LOST
@@ -129,19 +130,9 @@ def test_trained_masks_remove_what_was_planted_and_nothing_visible(planted_wall)
 def test_without_the_gate_most_of_them_stay(planted_wall):
     """The test above can fail: touching one pixel faintly is enough to score."""
     rows, planted = planted_wall
-    scores = measure_importance(contributions_of(rows, cameras(), BACKEND), gate=False)
-    keep = keep_by_importance(scores, Floors(0)).keep
+    found = scores(Views(activated(rows), cameras(), BACKEND).contributions, gate=False)
+    keep = keep_by_importance(found, Floors(0)).keep
     assert float((planted & ~keep).sum()) / 50 < RECALL
-
-
-def test_a_judge_needs_a_truth():
-    some, none = torch.tensor([True, False]), torch.zeros(2, dtype=torch.bool)
-    assert judge(~some, some, ~some).recall == 1.0
-    assert judge(some, some, ~some).visible_lost == 1.0
-    with pytest.raises(ValueError, match="planted"):
-        judge(some, none, some)
-    with pytest.raises(ValueError, match="planted"):
-        judge(some, some, some)
 
 
 def test_a_transparent_scene_hides_nothing():

@@ -110,8 +110,5 @@ def test_the_floor_holds_and_impossible_numbers_are_refused(make):
     assert (int(selection.keep.sum()), selection.floor_hit) == (2, True)
     with pytest.raises(ValueError, match="keep must be a fraction"):
         make(keep=-1)
-
-
-def test_a_negative_power_of_the_volume_is_refused():
     with pytest.raises(ValueError, match="beta is an exponent"):
         LightGaussianRule(keep=1, beta=-0.1)

@@ -11,17 +11,16 @@ from lightning import Callback, LightningDataModule, Trainer
 from torch import Tensor
 
 from sparsestreet.data.datamodule import OrderedFrames, StreetData
-from sparsestreet.data.lazy import as_frames
-from sparsestreet.data.log import Split
+from sparsestreet.data.lazy import Sweeps, as_frames
+from sparsestreet.data.log import DrivingLog, Split
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.records.curves import CountChange
 from sparsestreet.scene.density import DensityStatistics, DensityStrategy
 from sparsestreet.scene.effects import Effect
 from sparsestreet.scene.gaussians import RowPlan, Rows
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.learning_rate import LearningRate
-from sparsestreet.scene.masks import SampledMaskSettings, StaticMaskSettings
-from sparsestreet.scene.nodes import Background, BackgroundSettings, Node, Rigid, RigidSettings
+from sparsestreet.scene.masks import Mask, SampledMaskSettings, StaticMaskSettings
+from sparsestreet.scene.nodes import Background, Node, Rigid
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.callbacks.density_control import RowListener
 from sparsestreet.training.losses import Loss, Photometric
@@ -29,21 +28,10 @@ from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.types import Camera, Frame, Gaussians
+from tests.scene.street import background_settings, rigid_settings
 
 WIDTH, HEIGHT = 32, 16
 NUM_FRAMES = 5
-
-BASE = {
-    "min_gaussians": 0,
-    "max_gaussians": None,
-    "density": None,
-    "prunable": True,
-    "learning_rates": {
-        "rows": LearningRate(0.01),
-        "rotation_deltas": LearningRate(0.001),
-        "translation_deltas": LearningRate(0.001),
-    },
-}
 
 
 def make_rows(count: int, seed: int = 0, columns: Mapping[str, Tensor] | None = None, **buffers: Tensor) -> Rows:
@@ -66,25 +54,23 @@ def make_rows(count: int, seed: int = 0, columns: Mapping[str, Tensor] | None = 
     return Rows(parameters | extra, {"label": torch.arange(count), **buffers}, transient=extra.keys())
 
 
-def background(
-    count: int = 20, *, seed: int = 0, mask: StaticMaskSettings | SampledMaskSettings | None = None, **changes: Any
-) -> Background:
-    settings = BackgroundSettings(
-        **{**BASE, "mask": mask, "masked": mask is not None, "num_points": 0, "sources": {}, **changes}
-    )
-    trained = None if mask is None else mask.build(settings.min_gaussians)
-    columns = {} if trained is None else trained.initial_columns(count)
-    return Background(settings, make_rows(count, seed, columns), trained)
+Masks = StaticMaskSettings | SampledMaskSettings | None
 
 
-def rigid(
-    count: int = 10, *, seed: int = 1, mask: StaticMaskSettings | SampledMaskSettings | None = None, **changes: Any
-) -> Rigid:
+def masked_rows(count: int, seed: int, mask: Masks, floor: int, **buffers: Tensor) -> tuple[Rows, Mask | None]:
+    trained = None if mask is None else mask.build(floor)
+    return make_rows(count, seed, {} if trained is None else trained.initial_columns(count), **buffers), trained
+
+
+def background(count: int = 20, *, seed: int = 0, mask: Masks = None, **changes: Any) -> Background:
+    settings = background_settings(mask=mask, masked=mask is not None, **changes)
+    return Background(settings, *masked_rows(count, seed, mask, settings.min_gaussians))
+
+
+def rigid(count: int = 10, *, seed: int = 1, mask: Masks = None, **changes: Any) -> Rigid:
     """Two objects of 4 x 2 x 1.5 m and 1 x 1 x 2 m that stand at the origin; rows take turns between them."""
-    settings = RigidSettings(**{**BASE, "mask": mask, "masked": mask is not None, "box_margin": 0.1, **changes})
-    trained = None if mask is None else mask.build(settings.min_gaussians)
-    columns = {} if trained is None else trained.initial_columns(count)
-    rows = make_rows(count, seed, columns, instances=torch.arange(count) % 2)
+    settings = rigid_settings(mask=mask, masked=mask is not None, **{"prunable": True, "box_margin": 0.1} | changes)
+    rows, trained = masked_rows(count, seed, mask, settings.min_gaussians, instances=torch.arange(count) % 2)
     still = Trajectories(
         torch.tensor([[0.0, 1.0]] * 2),
         torch.tensor([[[1.0, 0.0, 0.0, 0.0]] * 2] * 2),
@@ -122,6 +108,13 @@ def frame_at(index: int = 0, width: int = WIDTH, height: int = HEIGHT, **known: 
     return Frame(
         Camera(torch.eye(4), intrinsics, width, height), index / (NUM_FRAMES - 1), index, 0, image=image, **known
     )
+
+
+def street_data(instants: int, stride: int, offset: int = 0) -> StreetData:
+    """So many instants of ``frame_at``, without lidar and boxes."""
+    frames = as_frames([frame_at(index) for index in range(instants)])
+    log = DrivingLog("street", frames, Sweeps.of(()), (), instants, 1, torch.eye(4).double())
+    return StreetData(log, stride=stride, offset=offset)
 
 
 def make_system(
@@ -189,7 +182,7 @@ class StubTrainer(Trainer):
         self.log_calls: list[tuple[str, float, dict[str, Any]]] = []
         system.trainer = self
         self.optimizers = [system.configure_optimizers()]
-        system.log, system.log_dict = self._log, self._log_dict
+        system.log = self._log
         for callback in self.callbacks:
             callback.setup(self, system, "fit")
 
@@ -249,10 +242,6 @@ class StubTrainer(Trainer):
     def _log_metrics(self, metrics: Mapping[str, float], step: int) -> None:
         """What the loggers of Lightning's trainer get."""
         self.log_calls += [(name, value, {"step": step}) for name, value in metrics.items()]
-
-    def _log_dict(self, dictionary: Any, *places: Any, **how: Any) -> None:
-        for name, value in dictionary.items():
-            self._log(name, value, **how)
 
 
 class _OneFrame(LightningDataModule):

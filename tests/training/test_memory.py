@@ -35,25 +35,16 @@ def test_the_forecast_is_what_a_device_needed():
         assert without_moments == pytest.approx(1e6 * one["memory_peak"], rel=1 / 8)
 
 
-def test_by_hand():
+def test_what_may_not_fit_is_warned_of_and_a_start_that_does_not_is_an_error():
     assert foreseen_bytes(10, 100.0, 7) == 10 * (4 * 100 + 350) + 7 * PIXEL_BYTES
-
-
-def test_what_fits_is_not_mentioned():
     enough = foreseen_bytes(2_000, COLUMNS, 100)
     assert memory_problem(1_000, 2_000, COLUMNS, 100, enough) is None
-
-
-def test_growth_that_may_not_fit_is_a_warning():
     said = memory_problem(1_000_000, 2_000_000, COLUMNS, 100, 2e9)
     assert said == (
         "the scene may outgrow the device: 2,000,000 Gaussians and an image of 100 pixels need about 2.6 GB, and the "
         "device has 2.0 GB: lower max_gaussians of the largest nodes, or the size of the images. More processes do not "
         "help, since each holds all Gaussians"
     )
-
-
-def test_a_start_that_does_not_fit_is_an_error():
     with pytest.raises(ValueError, match=r"^1,000,000 Gaussians .* about 1.3 GB, and the device has 1.0 GB: lower"):
         memory_problem(1_000_000, 2_000_000, COLUMNS, 100, 1e9)
 

@@ -12,6 +12,7 @@ from sparsestreet.training.callbacks import Checkpoints
 from sparsestreet.training.nonfinite import FEW, SHARE, NotFiniteError, Quarantine
 from sparsestreet.training.optimizer import OptimizerSettings
 from tests.training.stubs import background, fit, frame_at, make_system, rigid
+from tests.training.test_finite import Late
 
 MEANS = "nodes.background.rows.means"
 
@@ -71,7 +72,7 @@ def test_a_later_row_is_counted_and_not_said_again(caplog):
 
 
 def refused(parameters: list[torch.Tensor], counts: list[list[int]]) -> RefusedRows:
-    return RefusedRows(tuple(parameters), ({},) * len(parameters), torch.tensor(counts))
+    return RefusedRows(tuple(parameters), torch.tensor(counts))
 
 
 def look(quarantine: Quarantine, rows: int, count: int, name: str = MEANS) -> None:
@@ -105,19 +106,13 @@ def test_a_pose_whose_gradient_is_not_finite_ends_the_run_and_stays_as_it_was(tm
     assert list(tmp_path.iterdir()) == []
 
 
-class Late(torch.Tensor):
-    """Numbers that say they lie on a GPU."""
-
-    device = torch.device("cuda")
-
-
 def test_on_a_device_counts_are_read_one_step_later(monkeypatch):
     monkeypatch.setattr(nonfinite, "copy_to_host", lambda values: HostCopy(values.as_subclass(torch.Tensor), None))
     watched, parameter = Quarantine(), torch.zeros(50, 3)
 
     def late(count: int, step: int) -> None:
         counts = torch.tensor([[count, 7]]).as_subclass(Late)
-        watched.look(RefusedRows((parameter,), ({},), counts), [(MEANS, parameter)], frame_at(step), step)
+        watched.look(RefusedRows((parameter,), counts), [(MEANS, parameter)], frame_at(step), step)
 
     late(2, 1)
     assert watched.counts == {}

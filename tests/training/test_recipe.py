@@ -4,11 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-import torch
 
-from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Sweeps, as_frames
-from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
 from sparsestreet.pruning import ImportanceRule
 from sparsestreet.scene.density import GradientDensity
@@ -24,7 +20,7 @@ from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.schedule import Interval
 from sparsestreet.triangulation import ImagePointSettings
-from tests.training.stubs import background, frame_at
+from tests.training.stubs import background, street_data
 
 PLAIN = BackgroundSettings(mask=None, masked=False, density=None, prunable=False)
 MASKED = replace(PLAIN, mask=StaticMaskSettings(1e-3, threshold=0.01), masked=True)
@@ -36,9 +32,7 @@ def test_every_part_reaches_the_scene_or_the_system(monkeypatch):
     given: list[tuple[Any, ...]] = []
     scene = SceneGraph({"background": background(3)})
     monkeypatch.setattr(recipe_module, "build_scene", lambda *args: given.append(args) or scene)
-    frames = as_frames([frame_at(index) for index in range(7)])
-    log = DrivingLog("seven", frames, Sweeps.of(()), (), 7, 1, torch.eye(4).double())
-    data = StreetData(log, stride=3, offset=1, seed=8)
+    data = street_data(7, stride=3, offset=1)
     parts = Recipe(
         nodes={"background": PLAIN},
         effects={"sky": SkySettings(resolution=2)},
@@ -51,12 +45,12 @@ def test_every_part_reaches_the_scene_or_the_system(monkeypatch):
     )
     system = parts.build(data, parts.plan(data))
     ((*places, nodes, plan, seed, points),) = given
-    assert places == [log, data.split.train, frozenset({1, 4})]
+    assert places == [data.driving_log, data.split.train, frozenset({1, 4})]
     assert (nodes, plan, seed, points) == (parts.nodes, parts.plan(data), 5, parts.image_points)
     assert system.scene is scene
     assert system.losses == parts.losses
     assert (system.optimizer_settings, system.options) == (parts.optimizer, parts.options)
-    assert (system.radius, system.sh_interval) == (log.radius, 0.17)
+    assert (system.radius, system.sh_interval) == (data.driving_log.radius, 0.17)
 
 
 def recipe(settings: BackgroundSettings, *kinds: str) -> Recipe:

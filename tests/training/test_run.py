@@ -2,7 +2,6 @@
 
 import logging
 import shutil
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,8 +15,6 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Sweeps, as_frames
-from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing
 from sparsestreet.evidence.light import measured_light
@@ -40,7 +37,7 @@ from sparsestreet.training.recipe import Recipe, RunIdentity
 from sparsestreet.training.run import CPU_TRAINER, fit, train
 from sparsestreet.training.schedule import Interval
 from tests.evaluation.frames import make_summary
-from tests.training.stubs import background, frame_at, make_system
+from tests.training.stubs import background, make_system, street_data
 
 pytestmark = pytest.mark.lengthy
 
@@ -50,9 +47,7 @@ TRAINER = partial(CPU_TRAINER, log_every_n_steps=2)
 
 def data() -> StreetData:
     """Five instants, of which 1 and 3 are held out."""
-    frames = as_frames([frame_at(index) for index in range(5)])
-    log = DrivingLog("five", frames, Sweeps.of(()), (), 5, 1, torch.eye(4).double())
-    return StreetData(log, stride=2, offset=1)
+    return street_data(5, stride=2, offset=1)
 
 
 def recipe(out: Path, *watch: Callback) -> Recipe:
@@ -90,7 +85,7 @@ def files(folder: Path) -> list[Path]:
 
 def test_a_run_is_called_after_its_folder_and_leaves_what_the_command_leaves(whole):
     run, summary = RUN.read(whole), SUMMARY.read(whole)
-    assert (run.label, run.method, run.sparsify, run.scene) == ("mine", "python", "none", "five")
+    assert (run.label, run.method, run.sparsify, run.scene) == ("mine", "python", "none", "street")
     assert (run.steps, run.max_steps, run.seed, run.split) == (STEPS, STEPS, 0, "every 2th frame from 1")
     assert run.device.startswith("cpu: ")
     assert run.threads == torch.get_num_threads()
@@ -99,12 +94,6 @@ def test_a_run_is_called_after_its_folder_and_leaves_what_the_command_leaves(who
     assert {"train", "evaluate", "save"} < COSTS.read(whole).phases.keys()
     for name in ("views.json", "curves/metrics.csv", "curves/counts.png", "pictures/sheet.png"):
         assert (whole / name).is_file(), name
-
-
-def test_the_seed_of_a_run_is_that_of_its_recipe(tmp_path):
-    described = RunIdentity(label="mine").describe(replace(recipe(tmp_path), seed=3), data(), STEPS)
-    assert described.seed == 3
-    assert described.cameras == ("0 32x16",)
 
 
 class Steps(Callback):
@@ -160,15 +149,7 @@ class NotTheFirst(SingleDeviceStrategy):
     is_global_zero: bool = False
 
 
-def test_of_several_processes_the_first_alone_writes(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "help_to_evaluate", lambda *args, **how: None)
-    monkeypatch.setattr(rank_zero_only, "rank", 1)
-    other = partial(TRAINER, strategy=NotTheFirst(device="cpu"), accelerator="auto")
-    assert train(recipe(tmp_path), data(), tmp_path, max_steps=4, make_trainer=other) is None
-    assert files(tmp_path) == []
-
-
-def test_another_process_leaves_what_the_first_one_wrote(whole, monkeypatch):
+def test_of_several_processes_the_first_alone_writes(whole, monkeypatch):
     before = {path: path.stat().st_mtime_ns for path in files(whole)}
     monkeypatch.setattr(run, "help_to_evaluate", lambda *args, **how: None)
     monkeypatch.setattr(rank_zero_only, "rank", 1)
@@ -323,7 +304,7 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
     )  # fmt: skip
     found = who.describe(Recipe(nodes={}, seed=6), data(), 17, (sky,))
     expected = {"label": "l", "method": "m", "sparsify": "s", "config": config, "data_hash": "h", "command": "c"}
-    expected |= {"config_hash": config_hash(config), "scene": "five", "seed": 6, "split": "every 2th frame from 1"}
+    expected |= {"config_hash": config_hash(config), "scene": "street", "seed": 6, "split": "every 2th frame from 1"}
     expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
     expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2, "cameras": ("0 32x16",)}
     expected |= {"effects": (sky,), "rested": {}, "held_back": {}}

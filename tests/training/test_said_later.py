@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.host_copy import HostCopy, copy_to_host
+from sparsestreet.host_copy import HostCopy
 from sparsestreet.training import nonfinite
 from sparsestreet.training.nonfinite import SaidLater
 from tests.training.stubs import StubTrainer, background, make_system
@@ -79,9 +79,3 @@ def test_rows_are_written_before_what_follows_them(trainer: StubTrainer):
         trainer.global_step += 1
         getattr(trainer.system, hook)(*([{}] if hook == "on_save_checkpoint" else []))
         assert [name for name, _, _ in trainer.log_calls] == ["loss", "epoch"]
-
-
-def test_on_a_host_everything_is_there():
-    way = copy_to_host(torch.tensor([1.0, 2.0]))
-    assert way.ready
-    assert way.wait().tolist() == [1.0, 2.0]

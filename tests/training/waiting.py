@@ -200,6 +200,6 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
         patch.setattr(screen, "wait_for", counted)
-        for module in (nonfinite, nonfinite, nonfinite, screen):
+        for module in (nonfinite, screen):
             patch.setattr(module, "copy_to_host", queued)
         yield found

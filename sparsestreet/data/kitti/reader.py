@@ -251,7 +251,7 @@ class KittiReader(RecordedReader):
             shots=_shots(drive, parts),
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=self.given.kinds if self.given else frozenset(),
+            mask_kinds=self.given.kinds,
             frame_stamps=parts.clock.stamps,
             sweeps=_sweeps(drive, parts) if self.lidar and drive.lidar.is_dir() else None,
             boxes=None if parts.tracklets is None else _boxes(drive, parts, parts.tracklets),
@@ -281,8 +281,7 @@ class KittiReader(RecordedReader):
         drive = self._drive()
         images = [drive.image(camera, frame) for camera, frame in product(drive.cameras, drive.frames)]
         problems = missing_files([*images, *map(drive.oxts, drive.frames)])
-        if self.given is not None:
-            problems += self.given.check((path.parts[-3], path.stem) for path in images)
+        problems += self.given.check((path.parts[-3], path.stem) for path in images)
         calibration = attempt(problems, lambda: read_calibration(drive.folder.parent, drive.cameras))
         clock = attempt(problems, lambda: read_clock(drive))
         oxts, poses = _read_poses(drive, problems)

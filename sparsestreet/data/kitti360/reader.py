@@ -107,7 +107,7 @@ class Kitti360Reader(RecordedReader):
         sequence, parts = self._sequence(), self._parts()
         rig = tuple(self._rig_camera(parts.calibration, index, name) for index, name in enumerate(sequence.cameras))
         sizes = tuple(parts.calibration.cameras[name].size for name in sequence.cameras)
-        labeled = _labeled(sequence, parts.frames) if self.given is None else set()
+        labeled = _labeled(sequence, parts.frames) if self.masks is None else set()
         pixels = Pixels(rig, sizes, self.given, partial(_labels, sequence, rig, sizes, labeled))
         return Recording(
             name=sequence.name.removesuffix("_sync"),
@@ -115,7 +115,7 @@ class Kitti360Reader(RecordedReader):
             shots=_shots(sequence, parts),
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=self.given.kinds if self.given else frozenset(KINDS if labeled else ()),
+            mask_kinds=self.given.kinds.union(KINDS if labeled else ()),
             frame_stamps=parts.stamps,
             sweeps=_sweeps(sequence, parts) if self.lidar and sequence.lidar.is_dir() else None,
             boxes=parts.boxes,
@@ -157,8 +157,7 @@ class Kitti360Reader(RecordedReader):
         frames = self._window(sequence, poses)
         images = [sequence.image(camera, frame) for camera, frame in product(sequence.cameras, frames)]
         problems = missing_files(images)
-        if self.given is not None:
-            problems += self.given.check((path.parts[-3], path.stem) for path in images)
+        problems += self.given.check((path.parts[-3], path.stem) for path in images)
         if not are_rigid(torch.stack([poses[frame] for frame in frames])):
             for frame in frames:
                 attempt(problems, partial(check_rigid, poses[frame], sequence.poses, f"the pose of frame {frame}"))

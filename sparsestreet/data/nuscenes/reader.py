@@ -218,9 +218,7 @@ class NuScenesReader(RecordedReader):
         if problems := missing_files(file.path for file in files):
             raise LogError(problems)
         rig, shots = self._rig(), _shots(chosen)
-        if self.given is not None and (
-            problems := self.given.check((rig[shot.camera].name, shot.stem) for shot in shots)
-        ):
+        if problems := self.given.check((rig[shot.camera].name, shot.stem) for shot in shots):
             raise LogError(problems)
         boxes, notes = self._boxes()
         if far := check_extent(_placed(shots, boxes or ())):
@@ -238,7 +236,7 @@ class NuScenesReader(RecordedReader):
             shots=shots,
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=frozenset(["ego"] if egos else ()).union(self.given.kinds if self.given else ()),
+            mask_kinds=frozenset(["ego"] if egos else ()).union(self.given.kinds),
             # Behind the last image there are no frames.
             frame_stamps=tuple(chosen.instants.stamps[instant] for instant in chosen.window)[: 1 + shots[-1].frame],
             sweeps=self._sweeps(),

@@ -222,9 +222,9 @@ class WaymoReader(RecordedReader):
         segment, frames, cameras = self._segment, self._frames, self._cameras
         rig, shots, boxes, notes = self._rig(), *self._placed()
         given = self.given
-        if given is not None and (missing := given.check((cameras[shot.camera], shot.stem) for shot in shots)):
+        if missing := given.check((cameras[shot.camera], shot.stem) for shot in shots):
             raise LogError(missing)
-        labelled = segment.labelled & {shot.key for shot in shots if given is None}
+        labelled = segment.labelled & {shot.key for shot in shots if given.root is None}
         kinds = frozenset({"sky", "human", "vehicle"} if labelled else ())
         # Behind the last image there are no frames.
         seen = frames[: 1 + shots[-1].frame]
@@ -235,7 +235,7 @@ class WaymoReader(RecordedReader):
             shots=shots,
             read_image=partial(_read_image, segment, rig),
             read_masks=partial(_read_masks, segment, rig, labelled, given),
-            mask_kinds=kinds if given is None else given.kinds,
+            mask_kinds=kinds | given.kinds,
             frame_stamps=stamps,
             vehicle=PosePath(torch.tensor(stamps), torch.stack([segment.world_from_vehicle(frame) for frame in seen])),
             sweeps=self._sweeps() if self.lidar else None,
@@ -361,16 +361,14 @@ def _read_masks(
     segment: Segment,
     rig: Sequence[RigCamera[str]],
     labelled: frozenset[tuple[int, str]],
-    given: GivenMasks | None,
+    given: GivenMasks,
     shot: RecordedImage,
 ) -> Mapping[str, Bool[Tensor, "h w"]]:
     """Those that somebody made for all images, or else those that Waymo had made for some."""
     camera, frame = rig[shot.camera], int(shot.stem)
     recorded = segment.cameras[camera.name].size
-    if given is not None:
-        return given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size)
     if (frame, camera.name) not in labelled:
-        return {}
+        return given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size)
     data, divisor = segment.panoptic(frame, camera.name)
     what = f"the panoptic label of {camera.name} at frame {frame}"
     return decode_masks(data, divisor, recorded, camera.size, segment.label_file, what)

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 from lightning import Callback, Trainer
+from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
@@ -44,11 +45,6 @@ def resize_rows(trainer: Trainer, system: StreetSystem, node: str, plan: RowPlan
         if isinstance(callback, RowListener):
             callback.on_rows_changed(change, plan)
     log.debug("step %d: %s %s, %d -> %d rows", change.step, node, reason, before, change.after)
-
-
-def compare_rows(trainer: Trainer, system: StreetSystem) -> None:
-    """After a change of rows: see that all processes made the same one. Raises DisagreementError."""
-    check_agreement(system.scene, ranks_of(trainer))
 
 
 def end_mask(trainer: Trainer, system: StreetSystem, node: str) -> None:
@@ -181,7 +177,7 @@ class DensityControl(Callback, RowListener):
                 self._refine(trainer, pl_module, name)
             elif self.pause_after_reset is None:
                 statistics.reset()
-        compare_rows(trainer, pl_module)
+        check_agreement(pl_module.scene, self._ranks)
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: StreetSystem, batch: object, batch_idx: int) -> None:
         last = self.refine_in.last(pl_module.course)
@@ -269,7 +265,7 @@ class DensityControl(Callback, RowListener):
         own = {name: statistics.state_dict() for name, statistics in self.statistics.items()}
         state = {"statistics": own, "generator": self.generator.get_state(), "last_reset": self.last_reset}
         if self._ranks.size > 1:
-            state["of_others"] = self._ranks.gathered(_on_host(own))[1:]
+            state["of_others"] = self._ranks.gathered(move_data_to_device(own, "cpu"))[1:]
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
@@ -280,12 +276,6 @@ class DensityControl(Callback, RowListener):
         self.statistics = first
         self.generator.set_state(state_dict["generator"])
         self.last_reset = state_dict["last_reset"]
-
-
-def _on_host(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _on_host(one) for name, one in value.items()}
-    return value.cpu() if isinstance(value, Tensor) else value
 
 
 def _strategy(node: Node) -> DensityStrategy:

@@ -8,8 +8,9 @@ from lightning import Callback, Trainer
 from sparsestreet.phases import stage
 from sparsestreet.pruning import PruningRule, RenderContext
 from sparsestreet.scene.masks import Mask
-from sparsestreet.training.callbacks.density_control import compare_rows, end_mask, resize_rows
+from sparsestreet.training.callbacks.density_control import end_mask, resize_rows
 from sparsestreet.training.lightning import data_of, ends_step, ranks_of
+from sparsestreet.training.parallel import check_agreement
 from sparsestreet.training.schedule import Interval, milestone
 from sparsestreet.training.system import StreetSystem
 
@@ -43,7 +44,7 @@ class MaskTraining(Callback):
                 self._remove(trainer, pl_module, name, node.mask)
                 if last:
                     end_mask(trainer, pl_module, name)
-        compare_rows(trainer, pl_module)
+        check_agreement(pl_module.scene, ranks_of(trainer))
 
     def _remove(self, trainer: Trainer, system: StreetSystem, name: str, mask: Mask) -> None:
         node = system.scene.nodes[name]
@@ -90,7 +91,7 @@ class Pruning(Callback):
             passed = moments.index(trainer.global_step)
             context = RenderContext(pl_module.state(), pl_module.options, len(moments), passed, ranks_of(trainer))
             self._prune(trainer, pl_module, context)
-            compare_rows(trainer, pl_module)
+            check_agreement(pl_module.scene, context.ranks)
 
     def _prune(self, trainer: Trainer, pl_module: StreetSystem, context: RenderContext) -> None:
         frames = data_of(trainer).split.train

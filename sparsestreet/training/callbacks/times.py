@@ -10,6 +10,7 @@ from lightning import Callback, LightningModule, Trainer
 from sparsestreet.phases import PhaseRecorder, StageRecorder, clock_of
 from sparsestreet.records.costs import STEP_PHASES, StepPhase
 from sparsestreet.records.curves import HELD_OUT_CURVE, LEDGER, CountChange, HeldOutLook
+from sparsestreet.records.file import CsvFile
 from sparsestreet.scene.gaussians import RowPlan
 from sparsestreet.training.callbacks.density_control import RowListener
 from sparsestreet.training.lightning import ends_step
@@ -73,24 +74,57 @@ class StageTimes(Callback):
         self.recorder.go_on(state_dict["seconds"])
 
 
+class _Table(Callback):
+    """Rows that are written when training ends, or is interrupted; a checkpoint keeps them."""
+
+    file: CsvFile[Any]
+    kind: type[Any]
+    """Of a row."""
+    key = "rows"
+    """What a checkpoint calls them."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.rows: list[Any] = []
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self._write(trainer)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        # Training that failed before its start has nothing to say, and a full disk would hide what failed.
+        if self.rows and not isinstance(exception, OSError):
+            self._write(trainer)
+
+    def state_dict(self) -> dict[str, Any]:
+        return {self.key: [astuple(row) for row in self.rows]}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.rows = [self.kind(*row) for row in state_dict[self.key]]
+
+    def _write(self, trainer: Trainer) -> None:
+        if trainer.is_global_zero:
+            self.file.write_to(self.path, self.rows)
+
+
 LOOP = "loop"
 """What is in no phase: Lightning, and callbacks that have nothing to do in a step."""
 
 
-class PhaseTimes(Callback):
+class PhaseTimes(_Table):
     """Writes ``phases.csv`` when training ends, or is interrupted: step, phase, milliseconds.
 
     A step counts from the end of the one before it to its own. Most steps are not looked at and pay nothing; one that
     is costs some tens of microseconds more.
     """
 
+    file, kind = STEP_PHASES, StepPhase
+
     def __init__(self, path: str | Path, every: int = 47) -> None:
         """``every``: steps from one that is looked at to the next."""
+        super().__init__(path)
         if every < 1:
             raise ValueError(f"phases are noted every so many steps, at least 1, got {every}")
-        self.path = Path(path)
         self.every = every
-        self.rows: list[StepPhase] = []
         self._recorder: PhaseRecorder | None = None
 
     def on_train_batch_end(
@@ -99,77 +133,40 @@ class PhaseTimes(Callback):
         if not ends_step(trainer, batch_idx):
             return
         step = trainer.global_step
-        self._note(step)
+        self.rows += [StepPhase(step, name, 1e3 * seconds) for name, seconds in self._stop().items()]
         if (step + 1) % self.every == 0:
             self._recorder = PhaseRecorder(clock_of(pl_module.device), outside=LOOP)
             self._recorder.start()
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._forget()
-        self._write(trainer)
+        self._stop()
+        super().on_train_end(trainer, pl_module)
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        self._forget()
-        if self.rows and not isinstance(exception, OSError):
-            self._write(trainer)
+        self._stop()
+        super().on_exception(trainer, pl_module, exception)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # It would be counted as a part of the step that follows it.
-        self._forget()
+        self._stop()
 
-    def state_dict(self) -> dict[str, Any]:
-        return {"rows": [astuple(row) for row in self.rows]}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.rows = [StepPhase(*row) for row in state_dict["rows"]]
-
-    def _note(self, step: int) -> None:
-        if self._recorder is not None:
-            self.rows += [StepPhase(step, name, 1e3 * seconds) for name, seconds in self._recorder.stop().items()]
-            self._recorder = None
-
-    def _forget(self) -> None:
-        if self._recorder is not None:
-            self._recorder.stop()
-            self._recorder = None
-
-    def _write(self, trainer: Trainer) -> None:
-        if trainer.is_global_zero:
-            STEP_PHASES.write_to(self.path, self.rows)
+    def _stop(self) -> dict[str, float]:
+        recorder, self._recorder = self._recorder, None
+        return {} if recorder is None else recorder.stop()
 
 
-class RowLedger(Callback, RowListener):
+class RowLedger(_Table, RowListener):
     """Collects row changes and writes them as ``counts.csv`` when training ends, or is interrupted."""
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self.changes: list[CountChange] = []
+    file, kind, key = LEDGER, CountChange, "changes"
 
     def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         if change.after != change.before:
-            self.changes.append(change)
+            self.rows.append(change)
 
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
-        if not self.changes:
-            self.changes += [CountChange(0, node, 0, rows, "start") for node, rows in pl_module.scene.counts().items()]
-
-    def on_train_end(self, trainer: Trainer, pl_module: StreetSystem) -> None:
-        self._write(trainer)
-
-    def on_exception(self, trainer: Trainer, pl_module: StreetSystem, exception: BaseException) -> None:
-        # Training that failed before its start has nothing to say, and a full disk would hide what failed.
-        if self.changes and not isinstance(exception, OSError):
-            self._write(trainer)
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"changes": [astuple(change) for change in self.changes]}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.changes = [CountChange(*change) for change in state_dict["changes"]]
-
-    def _write(self, trainer: Trainer) -> None:
-        if trainer.is_global_zero:
-            LEDGER.write_to(self.path, self.changes)
+        if not self.rows:
+            self.rows += [CountChange(0, node, 0, rows, "start") for node, rows in pl_module.scene.counts().items()]
 
 
 COLUMNS = {"psnr_full": "val/psnr", "psnr_human": "val/psnr_human", "psnr_vehicle": "val/psnr_vehicle"}

@@ -93,13 +93,14 @@ def test_half_a_step_and_no_step_leave_no_checkpoint(tmp_path, step, exception):
     assert "interrupted.ckpt" not in contents(tmp_path)
 
 
-def test_what_fails_inside_a_step_leaves_no_checkpoint(tmp_path):
+def test_what_fails_inside_a_step_leaves_no_checkpoint(tmp_path, caplog):
     """Some parameters may have moved and others not."""
     trainer = trainer_in(tmp_path)
     trainer.walk(3)
     trainer.callbacks[0].on_train_batch_start(trainer, trainer.system, None, 3)
     trainer.callbacks[0].on_exception(trainer, trainer.system, RuntimeError("no memory"))
     assert contents(tmp_path) == {"last.ckpt": "2"}
+    assert caplog.messages == ["stopped inside step 4: go on from the checkpoint before it"]
 
 
 def test_a_flipped_bit_in_a_tensor_is_found(tmp_path):

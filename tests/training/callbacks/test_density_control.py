@@ -62,11 +62,10 @@ def test_a_node_may_grow_for_another_time_than_the_others():
 
 def test_a_reset_is_followed_by_a_pause():
     """Resets at 30 and 60, after the refinement that is due as well; none up to 20 steps later."""
-    listener, strategy = Listener(), AskedStrategy()
-    control = DensityControl(Interval(0.1, 0.9, every=10), 0.9, Interval(0.3, 0.6, every=30), pause_after_reset=20)
-    system = make_system({"background": background(density=strategy)})
-    trainer = StubTrainer(system, [control, listener])
-    trainer.start()
+    strategy = AskedStrategy()
+    trainer, _, listener = started(
+        every_ten(Interval(0.3, 0.6, every=30), pause=20), background=background(density=strategy)
+    )
     trainer.walk(100)
     assert asked_at(strategy, "cull") == asked_at(strategy, "densify") == [10, 20, 30, 60, 90]
     resets = [step for step, _, reason in listener.reasons if reason == "opacity reset"]

@@ -90,18 +90,6 @@ def test_statistics_start_anew_after_a_refinement_and_only_then():
     assert strategy.asked[-1]["statistics"].visits.max() == 4  # those of the pause as well
 
 
-def test_after_the_last_refinement_nothing_is_counted_any_more():
-    control = every_ten()
-    trainer, _, _ = started(control, background=background(4, density=KEEPS_ALL))
-    trainer.global_step = 89
-    trainer.train(1, frame_at())
-    trainer.train(3, frame_at())
-    assert not control.statistics["background"].visits.any()
-    trainer.global_step = 88
-    trainer.train(1, frame_at())
-    assert control.statistics["background"].visits.any()
-
-
 def test_statistics_follow_the_rows_whoever_changes_them():
     control = every_ten()
     nodes = {"first": background(4, density=KEEPS_ALL), "second": background(3, density=KEEPS_ALL)}

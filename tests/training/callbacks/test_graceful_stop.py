@@ -9,7 +9,7 @@ import torch
 from lightning import Callback, Trainer
 
 from sparsestreet.training.callbacks import Checkpoints, GracefulStop
-from sparsestreet.training.callbacks.files import SIGNALS, TornStop
+from sparsestreet.training.callbacks.files import SIGNALS
 from tests.training.stubs import background, fit, frame_at, make_system
 
 STEPS = 4
@@ -47,12 +47,12 @@ class Sends(Callback):
                 raise self.exception
 
 
-def train(folder: Any, sends: Sends) -> tuple[Any, GracefulStop]:
+def train(folder: Any, sends: Sends, stop: GracefulStop | None = None) -> GracefulStop:
     """A training of four steps with the callbacks as a run orders them."""
-    stop = GracefulStop()
-    system = make_system({"background": background(5)})
+    stop = stop or GracefulStop()
+    system = make_system({"background": background(5)}, sh_interval=1.0)  # else some columns start late
     fit(system, [sends, Checkpoints(folder), stop], STEPS, frame_at())
-    return system, stop
+    return stop
 
 
 @pytest.mark.parametrize(
@@ -60,10 +60,8 @@ def train(folder: Any, sends: Sends) -> tuple[Any, GracefulStop]:
     [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129), (signal.SIGUSR1, 138), (signal.SIGUSR2, 140)],
 )
 def test_a_signal_ends_training_after_its_step(tmp_path, handlers, number, status):
-    stop = GracefulStop()
-    system = make_system({"background": background(5)}, sh_interval=1.0)  # else some columns start late
     with pytest.raises(SystemExit):
-        fit(system, [Sends(2, number), Checkpoints(tmp_path), stop], STEPS, frame_at())
+        train(tmp_path, Sends(2, number), stop := GracefulStop())
     assert stop.exit_status == status
     saved = torch.load(tmp_path / "interrupted.ckpt", weights_only=False)
     assert saved["global_step"] == 2
@@ -74,11 +72,8 @@ def test_a_signal_ends_training_after_its_step(tmp_path, handlers, number, statu
 
 
 def test_what_clusters_send_behind_the_first_asks_for_nothing_new(tmp_path):
-    stop = GracefulStop()
-    system = make_system({"background": background(5)})
     with pytest.raises(SystemExit):
-        sends = Sends(2, signal.SIGUSR2, signal.SIGTERM, signal.SIGUSR2)
-        fit(system, [sends, Checkpoints(tmp_path), stop], STEPS, frame_at())
+        train(tmp_path, Sends(2, signal.SIGUSR2, signal.SIGTERM, signal.SIGUSR2), stop := GracefulStop())
     assert stop.exit_status == 140
     assert torch.load(tmp_path / "interrupted.ckpt", weights_only=False)["global_step"] == 2
 
@@ -86,22 +81,15 @@ def test_what_clusters_send_behind_the_first_asks_for_nothing_new(tmp_path):
 def test_an_ignored_signal_stays_ignored(tmp_path):
     """Of a run that nohup started, when its terminal closes."""
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    _, stop = train(tmp_path, Sends(2, signal.SIGHUP))
-    assert stop.exit_status == 0
+    assert train(tmp_path, Sends(2, signal.SIGHUP)).exit_status == 0
 
 
 def test_a_signal_is_handed_on_to_whoever_waited_for_it(tmp_path):
     """After the checkpoint is written; submitit requeues its job then."""
     seen: list[tuple[int, bool]] = []
     signal.signal(signal.SIGUSR2, lambda number, frame: seen.append((number, (tmp_path / "interrupted.ckpt").exists())))
-    stop = GracefulStop()
     with pytest.raises(SystemExit):
-        fit(
-            make_system({"background": background(5)}),
-            [Sends(2, signal.SIGUSR2), Checkpoints(tmp_path), stop],
-            STEPS,
-            frame_at(),
-        )
+        train(tmp_path, Sends(2, signal.SIGUSR2), stop := GracefulStop())
     assert seen == []
     stop.hand_on()
     assert seen == [(signal.SIGUSR2, True)]
@@ -177,8 +165,7 @@ def test_a_second_signal_stops_inside_the_step_and_leaves_no_checkpoint(tmp_path
 
 def test_a_whole_training_gives_the_handlers_back(tmp_path, handlers):
     sends = Sends(9)
-    _, stop = train(tmp_path, sends)
-    assert stop.exit_status == 0
+    assert train(tmp_path, sends).exit_status == 0
     assert not set(sends.within.values()) & set(handlers.values())
     assert present() == handlers
 
@@ -188,8 +175,3 @@ def test_a_failed_training_gives_the_handlers_back(tmp_path, handlers):
     with pytest.raises(RuntimeError, match="broken"):
         train(tmp_path, Sends(2, exception=RuntimeError("broken")))
     assert present() == handlers
-
-
-def test_a_torn_stop_is_a_keyboard_interrupt():
-    """Lightning shuts down in order for these alone."""
-    assert issubclass(TornStop, KeyboardInterrupt)

@@ -5,9 +5,6 @@ from collections.abc import Sequence
 
 import torch
 
-from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Sweeps, as_frames
-from sparsestreet.data.log import DrivingLog
 from sparsestreet.ops import SplatSettings
 from sparsestreet.pruning import ImportanceRule, PruningRule, RenderContext
 from sparsestreet.scene.gaussians import Selection
@@ -16,7 +13,17 @@ from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.callbacks import Pruning
 from sparsestreet.types import Frame
-from tests.training.stubs import Listener, StubTrainer, background, frame_at, labels, make_system, rigid, set_rows
+from tests.training.stubs import (
+    Listener,
+    StubTrainer,
+    background,
+    frame_at,
+    labels,
+    make_system,
+    rigid,
+    set_rows,
+    street_data,
+)
 
 
 class AskedRule(PruningRule):
@@ -31,19 +38,16 @@ class AskedRule(PruningRule):
         return self.answer
 
 
-def street_data() -> StreetData:
-    """Seven instants; 1 and 4 are held out."""
-    frames = as_frames([frame_at(index) for index in range(7)])
-    log = DrivingLog("seven", frames, Sweeps.of(()), (), 7, 1, torch.eye(4).double())
-    return StreetData(log, stride=3, offset=1)
+DATA = street_data(7, stride=3, offset=1)
+"""Instants 1 and 4 are held out."""
 
 
 def test_the_rule_is_asked_once_at_each_milestone_with_the_training_frames_and_todays_look():
-    rule, data = AskedRule(), street_data()
+    rule = AskedRule()
     options = RenderOptions(SplatSettings(near_plane=0.3), "reference")
     system = make_system({"background": background()}, options=options, sh_interval=0.3)
     trainer = StubTrainer(system, [Pruning([0.2, 0.55, 1.0], rule)], max_steps=20)
-    trainer.datamodule = data
+    trainer.datamodule = DATA
     steps = []
     for step in range(1, 21):
         before = len(rule.asked)
@@ -53,7 +57,7 @@ def test_the_rule_is_asked_once_at_each_milestone_with_the_training_frames_and_t
     for scene, frames, _ in rule.asked:
         assert scene is system.scene
         assert [frame.frame_index for frame in frames] == [0, 2, 3, 5, 6]
-        assert frames == data.split.train
+        assert frames == DATA.split.train
     states = [SceneState(0.2, 0, step=4), SceneState(0.55, 1, step=11), SceneState(1.0, 3, step=20)]
     contexts = [RenderContext(state, options, passes=3, passed=passed) for passed, state in enumerate(states)]
     assert [context for _, _, context in rule.asked] == contexts
@@ -89,7 +93,7 @@ def test_with_the_papers_rule_what_no_training_view_draws_goes():
         with torch.no_grad():
             node.rows.means[3, 2] = -5.0
     trainer = StubTrainer(make_system(nodes), [Pruning([0.01], ImportanceRule(gate=False))])
-    trainer.datamodule = street_data()
+    trainer.datamodule = DATA
     trainer.walk(1)
     assert labels(nodes["background"]) == [0, 1, 2, 4, 5]
     assert len(nodes["rest"].rows) == 4

@@ -7,11 +7,12 @@ from torch import Tensor, nn
 
 from sparsestreet.records.curves import CountChange
 from sparsestreet.scene.gaussians import RowPlan, Rows, Selection
+from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import Mask, StaticMaskSettings
 from sparsestreet.scene.nodes import Background
 from sparsestreet.training.callbacks import Clock
 from sparsestreet.training.callbacks.density_control import end_mask, resize_rows
-from tests.training.stubs import BASE, Listener, StubTrainer, background, frame_at, labels, make_rows, make_system
+from tests.training.stubs import Listener, StubTrainer, background, frame_at, labels, make_rows, make_system
 
 PLAN = RowPlan(4, torch.tensor([3, 1, 1]), torch.tensor([False, False, True]))
 
@@ -88,8 +89,7 @@ class TwoScores(Mask):
 @pytest.mark.parametrize("trained", [False, True])
 def test_a_masks_columns_and_parameters_leave_the_optimizer_and_its_rest_stays(trained):
     mask = TwoScores()
-    rates = {**BASE["learning_rates"], "mask": BASE["learning_rates"]["rows"]}
-    settings = background(1, learning_rates=rates).settings
+    settings = background(1, learning_rates=dict.fromkeys(("rows", "mask"), LearningRate(0.01))).settings
     node = Background(settings, make_rows(4, columns=mask.initial_columns(4)), mask)
     trainer = StubTrainer(make_system({"background": node, "other": background(2)}))
     if trained:

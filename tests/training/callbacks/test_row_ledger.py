@@ -50,18 +50,13 @@ step,node,before,after,reason
 """
 
 
-def test_the_file_by_hand(trainer, tmp_path):
+@pytest.mark.parametrize("end", [("on_train_end",), ("on_exception", KeyboardInterrupt())], ids=lambda end: end[0])
+def test_the_file_by_hand(trainer, tmp_path, end):
     """A line for every change of a number; where the number stays there is nothing to say."""
     trainer.start()
     change_rows(trainer)
-    trainer.callbacks[0].on_train_end(trainer, trainer.system)
-    assert (tmp_path / "records" / "counts.csv").read_text() == WHOLE
-
-
-def test_an_exception_leaves_the_file_as_far_as_training_came(trainer, tmp_path):
-    trainer.start()
-    change_rows(trainer)
-    trainer.callbacks[0].on_exception(trainer, trainer.system, KeyboardInterrupt())
+    hook, *exception = end
+    getattr(trainer.callbacks[0], hook)(trainer, trainer.system, *exception)
     assert (tmp_path / "records" / "counts.csv").read_text() == WHOLE
 
 

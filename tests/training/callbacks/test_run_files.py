@@ -51,33 +51,25 @@ def files(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def check_whole(trainer: StubTrainer, folder: Path) -> None:
-    assert files(folder) == {"scene.safetensors", "views.json", "rig.json", "run.json"}
-    stored = load_scene(folder)
+@pytest.mark.parametrize("end", [("on_train_end",), ("on_exception", KeyboardInterrupt())], ids=lambda end: end[0])
+def test_the_end_of_training_and_an_interruption_between_two_steps_leave_all(trainer, tmp_path, end):
+    hook, *exception = end
+    getattr(trainer.callbacks[0], hook)(trainer, trainer.system, *exception)
+    assert files(tmp_path) == {"scene.safetensors", "views.json", "rig.json", "run.json"}
+    stored = load_scene(tmp_path)
     assert stored.scene.counts() == trainer.system.scene.counts()
     assert (stored.name, stored.num_frames, stored.options) == ("seven", 7, OPTIONS)
-    views = read_views(folder / "views.json")
+    views = read_views(tmp_path / "views.json")
     assert [view.frame_index for view in views.training] == [0, 2, 3, 5, 6]
     assert [view.frame_index for view in views.held_out] == [1, 4]
     assert (views.frame_rate, [view.seconds for view in views.held_out]) == (4.0, [0.25, 1.0])
-    rig = RIG.read(folder)
+    rig = RIG.read(tmp_path)
     assert (rig.camera_names, rig.vehicle_stamps) == (("wide",), (0, 250_000_000))
     assert rig.dataset_from_world[0] == (1.0, 0.0, 0.0, 0.1 + 0.2)  # as they are, not rounded
     assert there(rig.world_from_vehicle)[1][2] == (0.0, 0.0, 1.0, 0.125)
-    run = RUN.read(folder)
+    run = RUN.read(tmp_path)
     assert (run.steps, run.training_seconds) == (trainer.global_step, 12.5)
-    assert run.label == make_run().label
-
-
-def test_the_end_of_training_leaves_all_three(trainer, tmp_path):
-    trainer.callbacks[0].on_train_end(trainer, trainer.system)
-    check_whole(trainer, tmp_path)
-    assert RUN.read(tmp_path).caps == {}
-
-
-def test_so_does_an_interruption_between_two_steps(trainer, tmp_path):
-    trainer.callbacks[0].on_exception(trainer, trainer.system, KeyboardInterrupt())
-    check_whole(trainer, tmp_path)
+    assert (run.label, run.caps) == (make_run().label, {})
 
 
 @pytest.mark.parametrize("exception", [TornStop(), OSError("no space left on device")])
@@ -105,6 +97,10 @@ def test_run_json_names_the_nodes_that_their_limit_held_down(trainer, tmp_path):
     resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(9) < 2), "cull")
     callback.on_train_end(trainer, system)
     assert RUN.read(tmp_path).caps == {"background": 10}
+    torch.save(callback.state_dict(), tmp_path / "state.pt")
+    resumed = RunFiles(tmp_path, make_run(), Clock())
+    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
+    assert resumed.caps == {"background": 10}
 
 
 def test_a_cull_to_the_limit_is_no_limit_that_held(tmp_path):
@@ -113,11 +109,3 @@ def test_a_cull_to_the_limit_is_no_limit_that_held(tmp_path):
     trainer = StubTrainer(system, [callback])
     resize_rows(trainer, system, "background", RowPlan.keep(torch.arange(8) < 6), "cull")
     assert callback.caps == {}
-
-
-def test_a_resumed_run_remembers_the_limits(trainer, tmp_path):
-    resize_rows(trainer, trainer.system, "background", grown(4, 6), "densify")
-    torch.save(trainer.callbacks[0].state_dict(), tmp_path / "state.pt")
-    resumed = RunFiles(tmp_path, make_run(), Clock())
-    resumed.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=True))
-    assert resumed.caps == {"background": 10}

@@ -1,10 +1,12 @@
-"""The terms of a step, and where its moved view stands."""
+"""The terms of a step, where its moved view stands, and what a run is told about its lidar before it trusts it."""
 
+import logging
 from dataclasses import replace
 
 import pytest
 import torch
 
+from sparsestreet.data.lidar import EdgeShift
 from sparsestreet.scene.effects import LensSettings
 from sparsestreet.scene.effects.optics import Pinhole
 from sparsestreet.scene.generators import named_generator
@@ -14,7 +16,7 @@ from sparsestreet.scene.state import SceneState
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
 from sparsestreet.training.moved_views import term as term_module
 from sparsestreet.training.moved_views.returns import Returns, StreetReturns, target
-from sparsestreet.training.moved_views.term import free_range
+from sparsestreet.training.moved_views.term import free_range, report_shift
 from sparsestreet.types import Camera, Frame, Track, View
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
 
@@ -192,20 +194,32 @@ def test_a_camera_keeps_off_walls():
 
 
 def test_a_step_adds_the_terms_and_one_without_them_is_as_before():
-    def loss(term: MovedViewTerm | None) -> float:
+    def step(every: int | None) -> tuple[float, bool]:
+        term = None if every is None else MovedViewTerm(MovedViews(every=every), street(wall(4.0)), seed=7)
         trainer = StubTrainer(make_system({"background": background(40, seed=3)}, moved_views=term), max_steps=12)
         trainer.global_step = 6
         value = trainer.system.training_step(frame_at(0, WIDTH, HEIGHT), 0).item()
-        names = trainer.system.said.newest.keys()
-        assert ({"train/moved_depth", "train/moved_color"} <= names) == (value != plain)
-        return value
+        return value, {"train/moved_depth", "train/moved_color"} <= trainer.system.said.newest.keys()
 
-    plain = make_loss_alone()
-    assert loss(MovedViewTerm(MovedViews(every=3), street(wall(4.0)), seed=7)) > plain
-    assert loss(MovedViewTerm(MovedViews(every=5), street(wall(4.0)), seed=7)) == plain
+    (plain, _), (with_terms, said) = step(None), step(3)
+    assert with_terms > plain
+    assert said
+    assert step(5) == (plain, False)
 
 
-def make_loss_alone() -> float:
-    trainer = StubTrainer(make_system({"background": background(40, seed=3)}), max_steps=12)
-    trainer.global_step = 6
-    return trainer.system.training_step(frame_at(0, WIDTH, HEIGHT), 0).item()
+@pytest.mark.parametrize(
+    ("shift", "level", "said"),
+    [
+        (EdgeShift(0.9, -1.9, 900), logging.INFO, "0.9 pixels to the right of those of the lidar and -1.9 below"),
+        (EdgeShift(-0.1, -2.1, 900), logging.WARNING, "-2.1 below: check calibration, poses and stamps"),
+        (EdgeShift(-1.1, 0.0, 900), logging.WARNING, "-1.1 pixels to the right"),
+        (None, logging.INFO, "too few edges are seen by lidar and cameras"),
+    ],
+)
+def test_a_lidar_beside_the_images_is_warned_of(
+    shift: EdgeShift | None, level: int, said: str, caplog: pytest.LogCaptureFixture
+):
+    with caplog.at_level(logging.INFO):
+        report_shift(shift)
+    assert [record.levelno for record in caplog.records] == [level]
+    assert said in caplog.text

@@ -10,8 +10,6 @@ from lightning import Callback, Trainer
 from torch import Tensor
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.lazy import Sweeps, as_frames
-from sparsestreet.data.log import DrivingLog
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule
 from sparsestreet.scene.density import DensityStatistics, GradientDensity
 from sparsestreet.scene.learning_rate import LearningRate
@@ -22,12 +20,12 @@ from sparsestreet.training.losses import MaskSparsity, Photometric
 from sparsestreet.training.run import fit
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
-from tests.training.stubs import BASE, Listener, background, frame_at, make_rows, make_system, rigid
+from tests.scene.street import RATES
+from tests.training.stubs import Listener, background, make_rows, make_system, rigid, street_data
 
 IMAGES = 48
 """A multiple of two and three, so that one process and several end with the same image."""
 STATIC = StaticMaskSettings(sparsity_weight=0.3, threshold=0.4, initial_logit=-0.2)
-RATES = {"mask": LearningRate(0.01)}
 TEMPORAL = TemporalMaskSettings(sparsity_weight=0.3, threshold=0.4, frames=2, features=2, width=4, octaves=1)
 
 
@@ -52,10 +50,7 @@ class Images(Callback):
 
 def data() -> StreetData:
     """Seven images: no number of processes divides an epoch."""
-    log = DrivingLog(
-        "seven", as_frames([frame_at(i) for i in range(7)]), Sweeps.of(()), (), 7, 1, torch.eye(4).double()
-    )
-    return StreetData(log, stride=0)
+    return street_data(7, stride=0)
 
 
 def system() -> StreetSystem:
@@ -71,7 +66,7 @@ def system() -> StreetSystem:
                 density=density,
                 max_gaussians=60,
                 min_gaussians=10,
-                learning_rates=BASE["learning_rates"] | RATES,
+                learning_rates=RATES | {"mask": LearningRate(0.01)},
             )
         ),
     }
