@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from lightning import Callback, Trainer
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -63,7 +62,6 @@ def draw_step(record: StepRecord, folder: Path) -> list[Path]:
     """Draw median milliseconds of each phase that takes at least a hundredth of the step, the longest on top."""
     shown = [phase for phase in record.phases if phase.time.median >= 0.01 * record.step.median]
     figure = Figure(figsize=(8.0, 1.3 + 0.34 * len(shown)), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for place, phase in enumerate(shown):
         color = _OP if phase.name.startswith("splat") else _REST

@@ -1,8 +1,7 @@
 """Points from images: features are matched along the epipolar lines of known poses, and triangulated.
 
-``features`` finds features in one image, ``pairs`` chooses images to compare, ``matches`` compares two. ``rays``
-computes where the rays of a point meet, ``points`` turns views into points. ``street`` separates what stands still from
-what is in boxes, and ``cache`` keeps the points on disk.
+``matches`` finds features, chooses images to compare and compares two. ``points`` computes where the rays of a point
+meet. ``street`` separates what stands still from what is in boxes, and keeps the points on disk.
 """
 
 from sparsestreet.triangulation.points import ImagePointSettings, TriangulatedPoints
