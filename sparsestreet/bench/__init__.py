@@ -1,6 +1,6 @@
 """Measure what the splat op costs in time, memory and accuracy: ``sparsestreet bench``.
 
 ``scenes`` makes what is drawn. ``timing`` and ``accuracy`` measure it. ``settings_sweep``, ``blend``, ``step``,
-``costs`` and ``scaling`` are the modes of the command. ``roofline`` holds the floors of a training step. ``records``
-writes one JSON line per measurement, and ``figures`` draws from those lines.
+``costs`` and ``scaling`` are the modes of the command. ``records`` writes one JSON line per measurement, and
+``figures`` draws from those lines.
 """

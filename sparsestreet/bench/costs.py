@@ -11,6 +11,7 @@ from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.scenes import DISTORTION, ROTATION, TRANSLATION, Size, frustum_camera, proxy_street
 from sparsestreet.bench.timing import TimeSpread, TimingBudget, spread
 from sparsestreet.evaluation.speed import frame_image
+from sparsestreet.geometry.cameras import resized
 from sparsestreet.scene.effects import Cost, Effect, EffectSettings, Finding
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
@@ -55,8 +56,7 @@ class EffectCost:
         off = f"{100 * (self.predicted_ms / self.ms.median - 1):+.0f} %" if self.firm else "within the noise"
         return (
             f"{self.effect:<14}{self.width:>5}x{self.height:<5}{self.rows:>9,} Gaussians: measured "
-            f"{self.ms.median:.3f} ± {self.error:.3f} ms, predicted "
-            f"{self.predicted_ms:.3f} ({off}); "
+            f"{self.ms.median:.3f} ± {self.error:.3f} ms, predicted {self.predicted_ms:.3f} ({off}); "
             f"{self.bytes:,} bytes, predicted {self.predicted_bytes:,}"
         )
 
@@ -86,9 +86,7 @@ class Street:
     def scaled(self, scale: float) -> "Street":
         """The same view in another size."""
         camera = self.view.camera
-        width, height = round(scale * camera.width), round(scale * camera.height)
-        factors = torch.tensor([[width / camera.width], [height / camera.height], [1.0]])
-        sized = replace(camera, intrinsics=factors * camera.intrinsics, width=width, height=height)
+        sized = resized(camera, height=round(scale * camera.height), width=round(scale * camera.width))
         return replace(self, view=replace(self.view, camera=sized))
 
     def through(self, name: str) -> View:

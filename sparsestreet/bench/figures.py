@@ -8,7 +8,6 @@ from typing import Any
 import matplotlib
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
@@ -129,7 +128,6 @@ def _pareto_figure(
 def _blank_figure(width: float, height: float, x_label: str, y_label: str) -> Figure:
     """A figure of this size in inches. Margins are fixed, because a layout engine would draw everything repeatedly."""
     figure = Figure(figsize=(width, height), dpi=110)
-    FigureCanvasAgg(figure)
     left, right, bottom, top = 0.9 / width, 1 - 0.2 / width, 0.8 / height, 1 - 0.4 / height
     figure.subplots_adjust(left, bottom, right, top, wspace=0.22, hspace=0.24)
     figure.supxlabel(x_label, y=0.15 / height)

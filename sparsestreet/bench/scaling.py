@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sparsestreet.bench.figures import save_figure
@@ -135,7 +134,6 @@ def draw_scaling(
 ) -> list[Path]:
     """Milliseconds of each part against (splat, tile) pairs, with its straight line; both axes logarithmic."""
     figure = Figure(figsize=(7.2, 4.6), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     dense = [min(work) * (max(work) / min(work)) ** (step / 60) for step in range(61)]
     for (name, values), color in zip(times.items(), ("#0072B2", "#D55E00", "#009E73"), strict=False):

@@ -16,9 +16,9 @@ def frustum_camera(width: int, height: int) -> Camera:
     return Camera(torch.eye(4), intrinsics, width, height)
 
 
-def frustum_gaussians(rows: int, camera: Camera, sigma_pixels: float, terms: int, seed: int = 0) -> Gaussians:
+def frustum_gaussians(rows: int, camera: Camera, sigma_pixels: float, terms: int) -> Gaussians:
     """Gaussians of depth 2 to 50 m, log-normal sizes of this median on the screen, opacity 0.05 to 0.95; float32."""
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
@@ -44,9 +44,9 @@ _CARS = ((-3.6, 9.0), (3.4, 14.0), (-3.4, 22.0), (3.6, 30.0), (-0.4, 38.0), (3.4
 _SHARES = {"road": 0.3, "facades": 0.4, "cars": 0.15, "poles": 0.1, "adrift": 0.05}
 
 
-def proxy_street(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
-    """``rows`` splats with ``terms`` spherical harmonics; float32, equal for the same seed."""
-    draw = _Draw(seed, unit=0.9 / math.sqrt(max(1, rows)))
+def proxy_street(rows: int, terms: int = 16) -> Gaussians:
+    """``rows`` splats with ``terms`` spherical harmonics; float32, the same every time."""
+    draw = _Draw(unit=0.9 / math.sqrt(max(1, rows)))
     counts = {name: int(share * rows) for name, share in _SHARES.items()}
     counts["facades"] += rows - sum(counts.values())
     parts = (
@@ -65,11 +65,11 @@ def proxy_street(rows: int, terms: int = 16, seed: int = 0) -> Gaussians:
 
 
 class _Draw:
-    """Random numbers of one seed, and a ``unit`` of size, radians, with which the rows just close the surfaces."""
+    """Random numbers, and a ``unit`` of size, radians, with which the rows just close the surfaces."""
 
-    def __init__(self, seed: int, unit: float) -> None:
+    def __init__(self, unit: float) -> None:
         self._unit = unit
-        self._generator = torch.Generator().manual_seed(seed)
+        self._generator = torch.Generator().manual_seed(0)
 
     def between(self, low: float | int, high: float | int, *shape: int) -> Tensor:
         return low + (high - low) * torch.rand(*shape, generator=self._generator)
@@ -165,29 +165,29 @@ class BenchScene:
     camera: Camera
 
 
-def bench_scenes(size: Size, street: BenchScene | None = None, seed: int = 0) -> list[BenchScene]:
-    """All five scenes, equal for the same seed; without a trained ``street`` a proxy scene takes its place."""
+def bench_scenes(size: Size, street: BenchScene | None = None) -> list[BenchScene]:
+    """All five scenes, the same every time; without a trained ``street`` a proxy scene takes its place."""
     camera = frustum_camera(size.width, size.height)
     if street is None:
         street = BenchScene("street", "proxy scene made of numbers, not trained", proxy_street(size.rows), camera)
-    frustum = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16, seed=seed)
+    frustum = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16)
     return [
         BenchScene("random frustum", "uniform in the frustum, median sigma 2 px", frustum, camera),
-        deep_stack(size, seed),
-        needles_and_giants(size, seed),
+        deep_stack(size),
+        needles_and_giants(size),
         street,
-        half_masked(street, seed),
+        half_masked(street),
     ]
 
 
-def deep_stack(size: Size, seed: int = 0) -> BenchScene:
+def deep_stack(size: Size) -> BenchScene:
     """Faint splats, STACK of them on a pixel in the middle of the image (fewer at its edges).
 
     A splat of opacity o reaches alpha_min = 1/255 on an area of 2 pi sigma^2 ln(255 o); rows x area = STACK x image.
     """
     camera = frustum_camera(size.width, size.height)
-    rows = frustum_gaussians(size.rows, camera, sigma_pixels=1.0, terms=16, seed=seed)
-    opacities = 0.01 + 0.04 * torch.rand(size.rows, generator=torch.Generator().manual_seed(seed))
+    rows = frustum_gaussians(size.rows, camera, sigma_pixels=1.0, terms=16)
+    opacities = 0.01 + 0.04 * torch.rand(size.rows, generator=torch.Generator().manual_seed(0))
     reach = float((255 * opacities).log().mean())
     sigma = math.sqrt(STACK * size.width * size.height / (size.rows * 2 * math.pi * reach))
     # Not round, because the rotation of a round splat has no gradient to compare.
@@ -196,15 +196,14 @@ def deep_stack(size: Size, seed: int = 0) -> BenchScene:
     return BenchScene("deep stack", f"{STACK} faint splats over a pixel, sigma {sigma:.1f} px", stacked, camera)
 
 
-def needles_and_giants(size: Size, seed: int = 0) -> BenchScene:
+def needles_and_giants(size: Size) -> BenchScene:
     """Half needles (0.1 to 1 px by 20 to 200 px), 1/20 giants (a tenth to half the image), the rest ordinary."""
     camera = frustum_camera(size.width, size.height)
-    rows = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16, seed=seed)
-    generator = torch.Generator().manual_seed(seed)
+    rows = frustum_gaussians(size.rows, camera, sigma_pixels=2.0, terms=16)
+    generator = torch.Generator().manual_seed(0)
 
     def log_uniform(low: float | int, high: float | int, columns: int) -> torch.Tensor:
-        draw = torch.rand(size.rows, columns, generator=generator)
-        return low * (high / low) ** draw
+        return low * (high / low) ** torch.rand(size.rows, columns, generator=generator)
 
     pixel = rows.means[:, 2:] / size.width
     needle = torch.cat((log_uniform(20, 200, 1), log_uniform(0.1, 1, 2)), -1) * pixel
@@ -216,9 +215,9 @@ def needles_and_giants(size: Size, seed: int = 0) -> BenchScene:
     return BenchScene("needles and giants", "half needles up to 200 px, a twentieth giants", odd, camera)
 
 
-def half_masked(street: BenchScene, seed: int = 0) -> BenchScene:
+def half_masked(street: BenchScene) -> BenchScene:
     """The street with a random half of its rows at opacity 0, as mask training leaves them before they are removed."""
-    kept = torch.rand(len(street.gaussians), generator=torch.Generator().manual_seed(seed)) < 0.5
+    kept = torch.rand(len(street.gaussians), generator=torch.Generator().manual_seed(0)) < 0.5
     opacities = torch.where(kept, street.gaussians.opacities, 0.0)
     masked = replace(street.gaussians, opacities=opacities)
     return BenchScene(f"{street.name}, half masked", street.source, masked, street.camera)

@@ -37,12 +37,6 @@ The exclusive stop may lose transmittance_min / (1 - alpha_max) of a pixel's lig
 """
 OTHER_BACKENDS = (("cpu", torch.float64), ("reference", torch.float32), ("triton", torch.float32))
 """The backends besides C++ in float32, which times all other points."""
-FIXED = {
-    ("dot precision", "cpu"): "no backend has a matrix product in its blend",
-    ("dot precision", "reference"): "a truth: matrix products in the dtype of the Gaussians",
-    ("dot precision", "triton"): "no backend has a matrix product in its blend",
-}
-"""Choices that a backend fixes: (knob, backend) -> what holds instead."""
 
 
 @dataclass(frozen=True)
@@ -178,15 +172,6 @@ class OracleRecord:
     errors: Errors
 
 
-@dataclass(frozen=True)
-class FixedRecord:
-    """A choice that a backend fixes."""
-
-    knob: str
-    backend: str
-    holds: str
-
-
 class Truths:
     """Float64 answers of one scene, each computed once."""
 
@@ -224,8 +209,6 @@ def run_sweep(
     built.
     """
     resolve_backend(_EXACT_BACKEND, torch.device("cpu"))
-    for (knob, backend), holds in FIXED.items():
-        file.write("fixed", FixedRecord(knob, backend, holds))
     for scene in small:
         file.write("oracle", check_oracle(scene))
         say(f"\nsmall copy of {title(scene)}")

@@ -79,9 +79,9 @@ class Cotangent:
     alpha: Tensor
 
     @staticmethod
-    def of(camera: Camera, like: Tensor, seed: int = 1) -> "Cotangent":
+    def of(camera: Camera, like: Tensor) -> "Cotangent":
         """Draw standard normal numbers, in float64 so that every dtype and device gets the same."""
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(1)
         values = torch.randn(camera.height, camera.width, 4, generator=generator, dtype=torch.float64).to(like)
         return Cotangent(values[..., :3].contiguous(), values[..., 3].contiguous())
 

@@ -405,12 +405,9 @@ class Mei(Lens):
         return math.acos(-self.xi) - 1e-6 if self.xi < 1 else math.pi
 
     def image(self, directions: Float64[Tensor, "*b 3"]) -> Float64[Tensor, "*b 2"]:
-        x, y, z = torch.nn.functional.normalize(directions, dim=-1).unbind(-1)
-        x, y = x / (z + self.xi), y / (z + self.xi)
-        r2 = x * x + y * y
-        radial = 1 + r2 * (self.k1 + r2 * self.k2)
-        column = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
-        row = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+        unit = torch.nn.functional.normalize(directions, dim=-1)
+        coefficients = torch.tensor([self.k1, self.k2, self.p1, self.p2, 0.0], dtype=torch.float64)
+        column, row = _brown_conrady(unit[..., :2] / (unit[..., 2:] + self.xi), coefficients).unbind(-1)
         return torch.stack((self.gamma1 * column + self.u0, self.gamma2 * row + self.v0), -1)
 
 

@@ -64,17 +64,15 @@ def color_map(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 
     return np.stack(channels, axis=-1).round().astype(np.uint8)
 
 
-def error_picture(
-    render: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"], scale: float = ERROR_SCALE
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return the mean absolute difference over RGB in [0, 1], divided by ``scale`` and colored.
+def error_picture(render: UInt8[np.ndarray, "h w 3"], truth: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Return the mean absolute difference over RGB in [0, 1], divided by ``ERROR_SCALE`` and colored.
 
     >>> black, white = np.zeros((1, 2, 3), np.uint8), np.full((1, 2, 3), 255, np.uint8)
     >>> error_picture(black, white)[0, 0].tolist()
     [252, 255, 164]
     """
     difference = np.abs(render.astype(np.float64) - truth.astype(np.float64)).mean(axis=-1) / 255
-    return color_map(difference / scale)
+    return color_map(difference / ERROR_SCALE)
 
 
 def draw_lidar_end(

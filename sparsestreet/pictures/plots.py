@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
@@ -29,7 +28,6 @@ def plot_counts(
     steps: Sequence[int],
     counts: Mapping[str, Sequence[int]],
     events: Sequence[tuple[int, str]] = (),
-    title: str = "Gaussians per node",
 ) -> None:
     """Draw the number of Gaussians of each node over training steps and marks events.
 
@@ -39,10 +37,7 @@ def plot_counts(
         counts: node -> number of Gaussians at each step (logarithmic axis; zeros are not drawn).
         events: (step, name), e.g. (2800, "pruning"); events of one name share a line style.
     """
-    for name, values in counts.items():
-        if len(values) != len(steps):
-            raise ValueError(f"counts of {name!r} have {len(values)} samples, steps {len(steps)}: log them together")
-    figure, axes = _figure(title, "step", "Gaussians")
+    figure, axes = _figure("Gaussians per node", "step", "Gaussians")
     for index, (name, values) in enumerate(counts.items()):
         drawn = [(step, value) for step, value in zip(steps, values, strict=True) if value > 0]
         label = f"{name} ({values[-1]:,})" if len(values) else name
@@ -78,11 +73,9 @@ def plot_psnr(
     _finish(figure, axes, path)
 
 
-def plot_runs(
-    path: Path, points: Mapping[str, Sequence[tuple[int, float]]], title: str = "Quality against size"
-) -> None:
+def plot_runs(path: Path, points: Mapping[str, Sequence[tuple[int, float]]]) -> None:
     """Draw every run as a point; ``points``: name of a variant -> (Gaussians, held-out PSNR in dB) of its runs."""
-    figure, axes = _figure(title, "Gaussians", "held-out PSNR, full image (dB)")
+    figure, axes = _figure("Quality against size", "Gaussians", "held-out PSNR, full image (dB)")
     for index, (name, runs) in enumerate(points.items()):
         gaussians, psnr = zip(*runs, strict=True)
         axes.scatter(
@@ -103,7 +96,6 @@ def plot_runs(
 
 def _figure(title: str, x_label: str, y_label: str) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(7.2, 4.2), dpi=130, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     axes.set_title(title)
     axes.set_xlabel(x_label)
@@ -237,7 +229,6 @@ def draw_evidence(path: Path, title: str, panels: Sequence[Panel]) -> None:
         raise ValueError("a picture of evidence needs a panel, and no effect has one")
     lines = -(-len(panels) // COLUMNS)
     figure = Figure(figsize=(12.0, 0.5 + 3.3 * lines), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
     cells = figure.subplots(lines, COLUMNS, squeeze=False).flat
     for axes, panel in zip(cells, panels, strict=False):
         axes.set_title(panel.title, fontsize=9)

@@ -57,11 +57,12 @@ def picture_sheet(
         legend: node -> its color in the centers, drawn at the foot.
         tile_width: pixels of each column; images are scaled to it.
     """
-    headings = ("render", "error", "Gaussian centers")
     lines: list[list[Tile | None]] = [
         [
             Tile(f"truth: {_view(picture)}", picture.truth),
-            *(Tile(*pair) for pair in zip(headings, _outcome(picture), strict=True)),
+            Tile("render", picture.render),
+            Tile("error", picture.error),
+            Tile("Gaussian centers", picture.centers),
         ]
         for picture in pictures
     ]
@@ -97,10 +98,6 @@ def comparison_sheet(
 
 def _view(picture: Picture) -> str:
     return f"frame {picture.frame}, camera {picture.camera}"
-
-
-def _outcome(picture: Picture) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return picture.render, picture.error, picture.centers
 
 
 def tile_sheet(tiles: Sequence[Tile], *, title: str, columns: int, tile_width: int) -> UInt8[np.ndarray, "h w 3"]:

@@ -61,9 +61,8 @@ def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointS
         in_boxes[track.name] = _inside(triangulate(list(own.values()), settings), list(own), track)
     static = [sighting.where(mask) for sighting, mask in zip(sightings, still, strict=True)]
     points = StreetPoints(triangulate(static, settings, _report), in_boxes)
-    log.info(
-        "points from %d images: %d that stand still, %d in boxes", len(frames), len(points.static), _total(in_boxes)
-    )
+    carried = sum(map(len, in_boxes.values()))
+    log.info("points from %d images: %d that stand still, %d in boxes", len(frames), len(points.static), carried)
     return points
 
 
@@ -71,10 +70,6 @@ def _report(done: int, total: int) -> None:
     """Log a line whenever another quarter of the pairs is compared."""
     if done * 4 // total > (done - 1) * 4 // total:
         log.info("points from images: %d of %d pairs compared", done, total)
-
-
-def _total(parts: Mapping[str, TriangulatedPoints]) -> int:
-    return sum(map(len, parts.values()))
 
 
 def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:

@@ -37,11 +37,8 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
     file, said = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE), []
     assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, said.append)
     records = read_records(file.path)
-    assert [record["renderer"] for record in records] == [
-        "sparsestreet cpu",
-        "gsplat 1.5.3 packed",
-        "gsplat 1.5.3 unpacked",
-    ]
+    renderers = ["sparsestreet cpu", "gsplat 1.5.3 packed", "gsplat 1.5.3 unpacked"]
+    assert [record["renderer"] for record in records] == renderers
     for record in records:
         assert record["failed"] is None
         assert record["forward"]["median"] > 0
@@ -88,16 +85,12 @@ def test_a_record_is_on_disk_before_the_next_is_measured(tmp_path, monkeypatch):
 
 
 def test_many_splats_are_not_compared(tmp_path, monkeypatch):
+    assert gpu.ROWS[0] <= gpu.TRUTH_ROWS  # the headline is
     monkeypatch.setattr(gsplat_baseline, "find_gsplat", lambda device: fake_gsplat(brightness=0.5))
     monkeypatch.setattr(gpu, "TRUTH_ROWS", 59)
     file = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE)
     assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, lambda text: None)
     assert [(record["parity"], record["agrees"]) for record in read_records(file.path)] == [(None, None)] * 3
-
-
-def test_the_headline_comes_first():
-    assert (gpu.IMAGES[0], gpu.ROWS[0]) == ((1920, 1280), 1_500_000)
-    assert gpu.ROWS[0] <= gpu.TRUTH_ROWS
 
 
 def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
@@ -195,15 +188,6 @@ def test_memory_and_stages_are_of_a_whole_step(rows, monkeypatch):
     assert record.ok
 
 
-def test_a_line_has_medians_and_spreads():
-    value, single = TimeSpread(1.25, 1.0, 0.125, 20), TimeSpread(3.0, 3.0, None, 1)
-    record = GpuRecord("sparsestreet triton", "a device", "random frustum", 7, 8, 9, forward=value, backward=single)
-    record = dataclasses.replace(record, inference=value, stages={"sort": value, "other": single})
-    text = gpu.line(record)
-    assert "forward 1.250 (iqr 0.125)  backward 3.000  no grad 1.250 (iqr 0.125) ms" in text
-    assert "[sort 1.250 (iqr 0.125), other 3.000]" in text
-
-
 def test_every_number_of_a_record_is_in_its_line():
     values = [TimeSpread(float(place), 0.5, None, 3) for place in range(1, 5)]
     record = GpuRecord("sparsestreet triton", "a device", "a street", 1234, 640, 480)
@@ -225,8 +209,11 @@ def test_every_number_of_a_record_is_in_its_line():
         f"{start}  no grad 1.000 ms  step 4.000  2.50 M pairs, 70 M samples  peak     345 MB  agrees: 61.2 dB"
         "  FAILED: late"
     )
-    busy = dataclasses.replace(whole, launches=31, waits=1)
-    assert gpu.line(busy) == gpu.line(whole).replace("  peak     345 MB", "  peak     345 MB  31 launches, 1 waits")
+    busy = dataclasses.replace(
+        whole, launches=31, waits=1, stages={"sort": TimeSpread(1.25, 1.0, 0.125, 20), "x": step}
+    )
+    said = "  peak     345 MB  31 launches, 1 waits  [sort 1.250 (iqr 0.125), x 4.000]"
+    assert gpu.line(busy) == gpu.line(whole).replace("  peak     345 MB", said)
     without = dataclasses.replace(whole, samples=None)
     assert gpu.line(without) == gpu.line(whole).replace(", 70 M samples", "")
     assert " M " not in gpu.line(dataclasses.replace(without, pairs=None))

@@ -194,7 +194,6 @@ def test_parts_end_as_by_ctrl_c_and_tests_keep_going_at_warnings(tmp_path):
             assert all(path.exists() for path in named)
 
 
-@pytest.mark.lengthy
 def test_files_without_their_packages_are_left_out_and_named(tmp_path):
     files = {
         "good": "",

@@ -26,14 +26,13 @@ SIZE = Size(96, 64, 1500)
 FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 
 
-def test_five_scenes_the_same_for_the_same_seed():
-    first, again, other = bench_scenes(SIZE), bench_scenes(SIZE), bench_scenes(SIZE, seed=1)
+def test_five_scenes_the_same_every_time():
+    first, again = bench_scenes(SIZE), bench_scenes(SIZE)
     assert len(first) == 5
     for a, b in zip(first, again, strict=True):
         assert all(torch.equal(getattr(a.gaussians, name), getattr(b.gaussians, name)) for name in FIELDS)
         assert len(a.gaussians) == SIZE.rows
         assert a.gaussians.sh.shape == (SIZE.rows, 16, 3)
-    assert not torch.equal(first[0].gaussians.means, other[0].gaussians.means)
 
 
 def test_deep_stack_is_as_deep_as_it_says():
@@ -82,23 +81,6 @@ def test_most_of_the_proxy_is_seen():
     assert bool(torch.isfinite(street.gaussians.sh).all())
 
 
-def test_every_scene_is_another_for_another_seed():
-    """The proxy of a street alone is always the same, but for what is masked of it."""
-    first, other = bench_scenes(SIZE), bench_scenes(SIZE, seed=1)
-    alike = [
-        all(torch.equal(getattr(a.gaussians, name), getattr(b.gaussians, name)) for name in FIELDS)
-        for a, b in zip(first, other, strict=True)
-    ]
-    assert alike == [False, False, False, True, False]
-    for make in (deep_stack, needles_and_giants):
-        scales, opacities = ([getattr(make(SIZE, seed).gaussians, name) for seed in (0, 1)] for name in FIELDS[2:4])
-        assert not torch.equal(*scales)
-        assert not torch.equal(*opacities)
-        assert torch.equal(make(SIZE).gaussians.scales, scales[0])
-    masks = [one[-1].gaussians.opacities == 0 for one in (first, other)]
-    assert 0.45 < float((masks[0] != masks[1]).float().mean()) < 0.55
-
-
 def test_the_camera_of_a_frustum():
     camera = frustum_camera(96, 64)
     assert camera.intrinsics.tolist() == [[96, 0, 48], [0, 96, 32], [0, 0, 1]]
@@ -128,65 +110,45 @@ def test_a_frustum_is_filled_evenly():
 
 
 def test_the_proxy_has_the_parts_of_a_street():
-    """Three tenths road, two fifths facades, then cars, poles and what floats: where each lies, and how large it is.
-
-    Sizes are factors of unit times distance, log-normal by 0.35; the unit is 0.9 over the root of the rows.
-    """
+    """Three tenths road, two fifths facades, then cars, poles and what floats."""
     rows = 20_000
     street = proxy_street(rows, terms=4)
-    names, shares = ("road", "facades", "cars", "poles", "adrift"), (0.3, 0.4, 0.15, 0.1, 0.05)
-    ends = [round(sum(shares[: place + 1]) * rows) for place in range(5)]
-    part = {name: slice(end - round(share * rows), end) for name, share, end in zip(names, shares, ends, strict=True)}
-    x, y, z = street.means.unbind(1)
-    factors = {"road": (1.5, 0.1, 6.0), "facades": (0.1, 1.2, 4.0), "cars": (0.7, 0.7, 0.7), "poles": (0.2, 6.0, 0.2),
-               "adrift": (6.0, 6.0, 6.0)}  # fmt: skip
-    unit = 0.9 / rows**0.5
-    for name, expected in factors.items():
-        logs = (street.scales[part[name]] / (unit * z[part[name], None])).log()
-        # 1,000 to 8,000 rows: four times 0.35 / sqrt(1000).
-        assert logs.mean(0).tolist() == pytest.approx([math.log(one) for one in expected], abs=0.045), name
-        assert logs.std(0).tolist() == pytest.approx([0.35] * 3, rel=0.1), name
-    for name in ("road", "facades", "adrift"):
-        depth = z[part[name]]
-        assert (float(depth.min()) >= 3.0 - 1e-4, float(depth.max()) <= 70.0 + 1e-3) == (True, True)
-        assert float(depth.log().mean()) == pytest.approx(math.log(210) / 2, abs=0.12)  # log-uniform
-    assert bool((y[part["road"]] == 1.6).all())
-    spans = {("road", 0): (-9, 9), ("facades", 1): (-12, 1.6), ("poles", 1): (-5, 1.6), ("adrift", 1): (-6, 1)}
-    for (name, axis), (low, high) in spans.items():
-        values = street.means[part[name], axis]
-        assert (float(values.min()), float(values.max())) == pytest.approx((low, high), abs=0.05), (name, axis)
-    sides = {name: set(x[part[name]].tolist()) for name in ("facades", "poles")}
-    assert sides == {"facades": {-9.5, 9.5}, "poles": {-6.5, 6.5}}
-    assert sorted(set(z[part["poles"]].tolist())) == [5.0 + 8 * place for place in range(8)]
-    slope = (x / z)[part["adrift"]]
-    assert (float(slope.min()), float(slope.max())) == pytest.approx((-0.6, 0.6), abs=0.01)
+    ends = [round(share * rows) for share in (0.3, 0.7, 0.85, 0.95)]
+    road, facades, cars, poles, adrift = street.means.tensor_split(ends)
+    assert bool((road[:, 1] == 1.6).all())
+    assert set(facades[:, 0].tolist()) == {-9.5, 9.5}
+    assert set(poles[:, 0].tolist()) == {-6.5, 6.5}
+    assert sorted(set(poles[:, 2].tolist())) == [5.0 + 8 * place for place in range(8)]
     # Each car's splats lie on the surface of its box, 1.8 x 1.5 x 4.2 m.
     centers = torch.tensor([(cx, 0.85, cz) for cx, cz in _CARS])
-    offsets = (street.means[part["cars"], None] - centers) / torch.tensor([0.9, 0.75, 2.1])
-    largest = offsets.abs().amax(2).amin(1)
-    assert largest.tolist() == pytest.approx([1.0] * len(largest), abs=1e-4)
-    met = offsets.abs().amax(2).argmin(1).bincount(minlength=6) / len(largest)
-    assert met.tolist() == pytest.approx([1 / 6] * 6, abs=0.03)
-    solid = street.opacities[: ends[3]]
-    assert float((solid > 0.5).float().mean()) == pytest.approx(0.67, abs=0.02)
-    assert (float(solid.min()), float(solid.max())) == pytest.approx((0.02, 0.99), abs=0.001)
-    assert bool(((solid < 0.4) | (solid > 0.6)).all())
-    faint = street.opacities[part["adrift"]]
-    assert (float(faint.min()), float(faint.max())) == pytest.approx((0.01, 0.15), abs=0.002)
-    colors = street.sh[:, 0] / (4 * math.pi) ** 0.5 + 0.5
-    ranges = {
-        "road": (0.2, 0.4),
-        "cars": (0.1, 0.9),
-        "facades": (0.3, 0.8),
-        "poles": (0.05, 0.25),
-        "adrift": (0.4, 0.7),
-    }
-    for name, (low, high) in ranges.items():
-        some = colors[part[name]]
-        assert low - 1e-4 <= float(some.min()) <= float(some.max()) <= high + 1e-4, name
-    assert float(street.sh[:, 1:].std()) == pytest.approx(0.05, rel=0.03)
+    largest = ((cars[:, None] - centers) / torch.tensor([0.9, 0.75, 2.1])).abs().amax(2)
+    assert largest.amin(1).tolist() == pytest.approx([1.0] * len(cars), abs=1e-4)
+    assert set(largest.argmin(1).tolist()) == set(range(6))
+    assert bool(((street.opacities[: ends[3]] < 0.4) | (street.opacities[: ends[3]] > 0.6)).all())
+    assert float(street.opacities[ends[3] :].max()) < 0.15
+    assert float((adrift[:, 0] / adrift[:, 2]).abs().max()) <= 0.6 + 1e-6
     assert bool((street.quaternions[:, 0] == 1).all())
-    assert float(street.quaternions[:, 1:].std()) == pytest.approx(0.03, rel=0.03)
+
+
+PROXY = {
+    "means": [0.12027, -1.79526, 23.1376, 7.3996, 4.01411, 17.7976],
+    "scales": [0.137405, 0.267056, 0.549568, 0.300805, 0.539851, 0.668776],
+    "opacities": [0.575571, 0.310184],
+    "quaternions": [1, -9.72738e-05, -0.000266505, -6.66057e-05, 0, 0.0302342, 0.0301941, 0.029902],
+    "constant": [-0.1934, -0.184602, -0.247655, 0.735739, 0.721439, 0.687349],
+    "others": [0.000136884, 0.0499927],
+}
+"""Mean and standard deviation of each column of 20,000 rows; of the coefficients of color, constant and others."""
+
+
+def test_the_proxy_is_what_it_was():
+    """Its times are compared over years."""
+    street = proxy_street(20_000, terms=4)
+    columns = {name: getattr(street, name) for name in ("means", "scales", "opacities", "quaternions")}
+    columns |= {"constant": street.sh[:, 0], "others": street.sh[:, 1:].flatten()}
+    found = {name: torch.stack((each.mean(0), each.std(0))).flatten().tolist() for name, each in columns.items()}
+    # Draws are equal on every processor but for their last digits.
+    assert found == {name: pytest.approx(numbers, rel=1e-3, abs=1e-4) for name, numbers in PROXY.items()}
 
 
 @pytest.mark.parametrize(("name", "bent", "rolling"), [("off", 0, 0), ("lens", 1, 0), ("shutter", 0, 1),

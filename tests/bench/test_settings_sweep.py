@@ -11,7 +11,7 @@ from sparsestreet.bench import figures, settings_sweep
 from sparsestreet.bench.accuracy import answer, errors
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scenes import Size, bench_scenes
-from sparsestreet.bench.settings_sweep import DEFAULT, FIXED, KNOBS, PRESETS, Point, points
+from sparsestreet.bench.settings_sweep import DEFAULT, KNOBS, PRESETS, Point, points
 from sparsestreet.bench.timing import TimingBudget
 from sparsestreet.ops import SplatSettings
 from tests.bench.test_records import PROVENANCE
@@ -73,11 +73,6 @@ def test_truths_of_a_point():
     assert clamped.exact.alpha_max == 0.999
 
 
-def test_what_a_backend_cannot_vary_has_a_reason():
-    assert {knob for knob, _ in FIXED} == {"dot precision"}
-    assert all(FIXED.values())
-
-
 def test_both_stops_at_every_transmittance():
     stops = {
         (point.settings.stop, point.settings.transmittance_min)
@@ -89,14 +84,10 @@ def test_both_stops_at_every_transmittance():
 
 
 def test_effects_off_and_on():
-    seen = [(point.value, point.effects, point.other_model) for point in POINTS if point.effects is not None]
-    assert seen == [
-        ("off", "off", False),
-        ("lens", "lens", True),
-        ("shutter", "shutter", True),
-        ("lens and shutter", "lens and shutter", True),
-    ]
-    assert all(point.settings == DEFAULT for point in POINTS if point.effects is not None)
+    points = [point for point in POINTS if point.effects is not None]
+    assert [point.value for point in points] == ["off", "lens", "shutter", "lens and shutter"]
+    assert [point.other_model for point in points] == [False, True, True, True]
+    assert all((point.effects, point.settings) == (point.value, DEFAULT) for point in points)
 
 
 pytestmark = pytest.mark.lengthy
@@ -120,7 +111,7 @@ def swept(tmp_path_factory):
 def test_a_record_for_every_point(swept):
     records, _, count = swept
     assert sum(record["kind"] == "knob" for record in records) == count * len(SCENES)
-    assert {record["kind"] for record in records} == {"knob", "small", "oracle", "fixed"}
+    assert {record["kind"] for record in records} == {"knob", "small", "oracle"}
     stages = {"forward", "backward", "project", "bin", "blend", "blend_backward", "project_backward"}
     for record in records:
         if record["kind"] == "knob" and record["backend"] == "cpu":
@@ -234,9 +225,7 @@ def test_truth_is_computed_once_and_near_changes_it_only_where_rows_are(monkeypa
 
 
 def test_gradient_errors_see_a_wrong_gradient():
-    scene = SCENES[0]
-    truth = answer(scene.gaussians, scene.camera, DEFAULT, "cpu", torch.float64)
-    value = answer(scene.gaussians, scene.camera, DEFAULT, "cpu", torch.float64)
+    truth, value = (answer(SCENES[0].gaussians, SCENES[0].camera, DEFAULT, "cpu", torch.float64) for _ in range(2))
     assert errors(value, truth).gradients["scales"].relative_l2 == 0
     value.gradients["scales"].mul_(1.5)
     found = errors(value, truth)
@@ -253,9 +242,3 @@ def test_figures_are_drawn(swept, tmp_path):
         "pareto_image.svg",
     ]
     assert all(path.stat().st_size > 10_000 for path in paths)
-
-
-@pytest.mark.slow
-def test_many_names_at_one_place_stay_inside_the_panel(swept, tmp_path):
-    records = [record | {"preset": "a name"} for record in swept[0] if record["kind"] == "knob"]
-    assert len(figures.draw_pareto(records, tmp_path)) == 4

@@ -1,4 +1,4 @@
-"""."""
+"""Projection, rays, moved cameras and transforms, against OpenCV, linear algebra and formulas written out."""
 
 from dataclasses import replace
 
@@ -60,14 +60,6 @@ def test_a_moved_camera_is_elsewhere_turned_as_it_was_in_its_own_dtype(dtype: to
     assert torch.equal(there.camera_from_world[:3, :3], camera.camera_from_world[:3, :3])
     # A float32 pose knows a place at 1 m to 1e-7, three roundings.
     torch.testing.assert_close(exact_position(there), exact_position(camera) + vector, atol=1e-6, rtol=0)
-
-
-def test_a_point_by_hand():
-    camera = Camera(torch.eye(4), torch.tensor([[10.0, 0, 8.0], [0, 20.0, 6.0], [0, 0, 1]]), 16, 12)
-    pixels, depth, inside = project(camera, torch.tensor([[1.0, -0.5, 5.0], [0.0, 0.0, -1.0], [9.0, 0.0, 10.0]]))
-    torch.testing.assert_close(pixels[0], torch.tensor([10.0, 4.0]))
-    assert depth.tolist() == [5.0, -1.0, 10.0]
-    assert inside.tolist() == [True, False, False]  # behind; 17 pixels to the right of 16
 
 
 def test_the_image_ends_before_its_width():
@@ -254,13 +246,6 @@ def random_transform(seed: int) -> Tensor:
 
 
 @examples
-@given(seeds)
-def test_inverse_is_that_of_linear_algebra(seed: int):
-    a_from_b = random_transform(seed)
-    torch.testing.assert_close(inverse(a_from_b), torch.linalg.inv(a_from_b), atol=1e-10, rtol=0)
-
-
-@examples
 @given(seeds, seeds)
 def test_chains_of_transforms(first: int, second: int):
     a_from_b, b_from_c = random_transform(first), random_transform(second)
@@ -270,8 +255,9 @@ def test_chains_of_transforms(first: int, second: int):
     torch.testing.assert_close(transform_points(inverse(a_from_b), transform_points(a_from_b, points)), points)
 
 
-def test_batched_inverse():
-    batch = torch.stack([random_transform(seed) for seed in range(3)])
+def test_inverse_is_that_of_linear_algebra():
+    batch = torch.stack([random_transform(seed) for seed in range(40)])
+    torch.testing.assert_close(inverse(batch), torch.linalg.inv(batch), atol=1e-10, rtol=0)
     assert torch.equal(inverse(batch)[1], inverse(batch[1]))
     assert inverse(batch[:0]).shape == (0, 4, 4)
 

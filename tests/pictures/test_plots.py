@@ -51,11 +51,8 @@ def test_counts_with_events(tmp_path, drawn):
         20,
     ]
     assert legend_of(drawn[0]) == ["background (400)", "rigid (50)", "prune", "mask"]
-    with pytest.raises(ValueError, match="counts of 'rigid' have 1 samples, steps 2"):
-        plot_counts(path, [0, 1], {"rigid": [3]})
 
 
-@pytest.mark.lengthy
 def test_no_two_variants_of_a_plot_look_alike(tmp_path, drawn):
     """More than there are colors, or markers."""
     plot_runs(tmp_path / "runs.png", {f"m{place}": [(1000 * (place + 1), 20.0)] for place in range(20)})
@@ -76,25 +73,21 @@ def test_counts_have_one_kind_of_labels(tmp_path, drawn):
 
 def test_every_plot_says_what_it_shows(tmp_path, drawn):
     plot_counts(tmp_path / "a.png", [0, 5], {"road": [10, 20]})
-    plot_counts(tmp_path / "a.png", [0, 5], {"road": [10, 20]}, title="mine")
     plot_psnr(tmp_path / "b.png", {"plain": ([0, 5], [10.0, 20.0])})
     plot_psnr(tmp_path / "b.png", {"plain": ([0, 5], [10.0, 20.0])}, (), "other", "seconds")
     plot_runs(tmp_path / "c.png", {"plain": [(1000, 25.0)]})
-    plot_runs(tmp_path / "c.png", {"plain": [(1000, 25.0)]}, "third")
     said = [(axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) for axes in (figure.axes[0] for figure in drawn)]
     assert said == [
         ("Gaussians per node", "step", "Gaussians"),
-        ("mine", "step", "Gaussians"),
         ("PSNR over training", "step", "PSNR (dB)"),
         ("other", "seconds", "PSNR (dB)"),
         ("Quality against size", "Gaussians", "held-out PSNR, full image (dB)"),
-        ("third", "Gaussians", "held-out PSNR, full image (dB)"),
     ]
-    scales = [(axes.get_xscale(), axes.get_yscale()) for axes in (figure.axes[0] for figure in drawn[::2])]
-    assert scales == [("linear", "log"), ("linear", "linear"), ("log", "linear")]
+    scales = [(axes.get_xscale(), axes.get_yscale()) for axes in (figure.axes[0] for figure in drawn)]
+    assert scales == [("linear", "log"), ("linear", "linear"), ("linear", "linear"), ("log", "linear")]
     assert drawn[0].axes[0].lines[0].get_drawstyle() == "steps-post"
     numbers = [formatter(value, 0) for formatter in (drawn[0].axes[0].yaxis.get_major_formatter(),
-               drawn[4].axes[0].xaxis.get_major_formatter(), drawn[4].axes[0].xaxis.get_minor_formatter())
+               drawn[3].axes[0].xaxis.get_major_formatter(), drawn[3].axes[0].xaxis.get_minor_formatter())
                for value in (950.0, 1000.0, 12_500.0, 1e6)]  # fmt: skip
     assert numbers == ["950", "1k", "12.5k", "1M"] * 3
 
@@ -187,7 +180,6 @@ def test_files_that_were_not_written_leave_their_picture_out(tmp_path, drawn_his
     assert drawn_history == {}
 
 
-@pytest.mark.lengthy
 def test_the_pictures_are_drawn(tmp_path):
     LEDGER.write(tmp_path, CHANGES)
     draw_history(tmp_path)

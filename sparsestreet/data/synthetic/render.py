@@ -240,11 +240,6 @@ def _recorded(
     return developed(mounted, at_night(settings, sight, frame, camera), recorded_gains(settings, frame, camera))
 
 
-def render_image(settings: StreetSettings, instant: Instant, camera: StreetCamera) -> StreetImage:
-    """Render what a camera sees at an instant; of the settings it uses only the number of rays per pixel."""
-    return developed(camera, instant.seen_by(camera, settings.supersampling))
-
-
 def developed(camera: StreetCamera, sight: Sight, gains: Float32[np.ndarray, "3"] | None = None) -> StreetImage:
     """Return the picture of what a camera saw."""
     return StreetImage(camera, to_srgb(sight.linear, gains), sight.depth, sight.object_indices, sight.sky)

@@ -180,8 +180,17 @@ class StreetSettings:
         for name in not_negative:
             if getattr(self, name) < 0:
                 raise ValueError(f"StreetSettings.{name} must not be negative but is {getattr(self, name)}")
-        if not 1 <= self.num_cameras <= len(CAMERA_YAWS_DEGREES):
-            raise ValueError(f"StreetSettings.num_cameras must be 1, 2 or 3 but is {self.num_cameras}")
+        limits = {
+            "num_cameras": (1, len(CAMERA_YAWS_DEGREES), "be 1, 2 or 3"),
+            "limp": (0, 1, "be a share from 0 to 1"),
+            "jpeg": (1, 100, "be a quality from 1 to 100"),
+            "hood": (0, 0.5, "be a share of the image up to 0.5"),
+            "dirt": (0, 0.1, "be a share of the image up to 0.1"),
+            "field_of_view": (10, 120, "lie in [10, 120] degrees"),
+        }
+        for name, (low, high, words) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise ValueError(f"StreetSettings.{name} must {words} but is {getattr(self, name)}")
         for name in ("readout", "shutter_time"):
             if getattr(self, name) * self.frame_rate >= 1:
                 frame = f"a frame of {1 / self.frame_rate:g} s"
@@ -189,14 +198,6 @@ class StreetSettings:
         if self.readout_direction not in get_args(Side):
             sides = ", ".join(get_args(Side))
             raise ValueError(f"StreetSettings.readout_direction must be one of {sides} but is {self.readout_direction}")
-        if not 0 <= self.limp <= 1:
-            raise ValueError(f"StreetSettings.limp must be a share from 0 to 1 but is {self.limp}")
-        if not 1 <= self.jpeg <= 100:
-            raise ValueError(f"StreetSettings.jpeg must be a quality from 1 to 100 but is {self.jpeg}")
-        if self.hood > 0.5:
-            raise ValueError(f"StreetSettings.hood must be a share of the image up to 0.5 but is {self.hood}")
-        if self.dirt > 0.1:
-            raise ValueError(f"StreetSettings.dirt must be a share of the image up to 0.1 but is {self.dirt}")
         if self.hood_cameras not in ("front", "all"):
             raise ValueError(f"StreetSettings.hood_cameras must be front or all but is {self.hood_cameras}")
         if self.white_balance and self.num_cameras == 1:
@@ -208,8 +209,6 @@ class StreetSettings:
                 f"StreetSettings.turn must keep the car within {_LANE:g} m of its lane's middle, but {self.turn:g} "
                 f"degrees at {self.ego_speed:g} m/s take it {swing(self.ego_speed, self.turn):.2f} m off: turn less"
             )
-        if not 10 <= self.field_of_view <= 120:
-            raise ValueError(f"StreetSettings.field_of_view must lie in [10, 120] degrees but is {self.field_of_view}")
         # Equal values compare equal, whatever type of sequence or number they were given as.
         object.__setattr__(self, "delays", tuple(float(value) for value in self.delays))
         if self.delays and (

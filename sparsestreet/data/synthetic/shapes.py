@@ -49,8 +49,8 @@ def _away_from_zero(values: np.ndarray) -> np.ndarray:
     return np.where(np.abs(values) < _TINY, _TINY, values)
 
 
-def _slab(origins: Float32[np.ndarray, " m"], directions: Scalars, half: float) -> tuple[Scalars, Scalars]:
-    """Return the distances at which rays enter and leave |coordinate| <= half."""
+def _slab(origins: np.ndarray, directions: np.ndarray, half: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distances at which rays enter and leave |coordinate| <= half (Kay and Kajiya)."""
     inverse = np.float32(1) / _away_from_zero(directions)
     center = -origins * inverse
     reach = np.float32(half) * np.abs(inverse)
@@ -59,15 +59,13 @@ def _slab(origins: Float32[np.ndarray, " m"], directions: Scalars, half: float) 
 
 @dataclass(frozen=True)
 class Box:
-    """A box: |x|, |y|, |z| <= half_extent (Kay and Kajiya's slabs)."""
+    """A box: |x|, |y|, |z| <= half_extent, three slabs."""
 
     half_extent: Vector
 
     def enter(self, origins: Float32[np.ndarray, "3 m"], directions: Vectors) -> Scalars:
-        inverse = np.float32(1) / _away_from_zero(directions)
-        center = -origins * inverse
-        reach = self.half_extent[:, None] * np.abs(inverse)
-        return _entered((center - reach).max(0), (center + reach).min(0))
+        near, far = _slab(origins, directions, self.half_extent[:, None])
+        return _entered(near.max(0), far.min(0))
 
     def normals(self, points: Vectors) -> Vectors:
         face = (np.abs(points) - self.half_extent[:, None]).argmax(0)

@@ -97,14 +97,16 @@ def _shortest_turn(start: Float64[np.ndarray, "3"], end: Float64[np.ndarray, "3"
     return Rotation.from_rotvec(axis * (angle / sine if sine > 0 else 1.0)).as_matrix()
 
 
+MINIMUM_PIXELS = 6
+"""A person has a pose in a frame only if a camera sees it with at least this many pixels."""
+
+
 @dataclass
 class BodyWriter:
     """Collects the poses of annotated pedestrians with noise, from the camera that sees most of each person."""
 
     settings: StreetSettings
     world: World
-    min_pixels: int
-    """A person has a pose in a frame only if a camera sees it with at least this many pixels."""
     _people: dict[int, dict[str, Any]] = field(default_factory=dict)
     """Instance id -> its data under DriveStudio's names."""
 
@@ -113,7 +115,7 @@ class BodyWriter:
         person = self.world.actors[actor]
         pixels = [np.count_nonzero(image.object_indices == actor) for image in frame.images]
         camera = int(np.argmax(pixels))
-        if not isinstance(person.model, Pedestrian) or pixels[camera] < self.min_pixels:
+        if not isinstance(person.model, Pedestrian) or pixels[camera] < MINIMUM_PIXELS:
             return
         rotations = joint_rotations(person.model, person.path.traveled(frame.index / self.settings.frame_rate))
         rng = stream(self.settings.seed, f"body of {person.name} {frame.index}")
@@ -185,7 +187,6 @@ def _motion(settings: StreetSettings, world: World, frame: int, camera: int) -> 
     return np.concatenate((pose[:3, :3].T @ (end[:3, 3] - start[:3, 3]), pose[:3, :3].T @ turn)).tolist()
 
 
-MINIMUM_PIXELS = 6
 MINIMUM_RETURNS = 3
 """Least number of lidar returns on an annotated object; ``MINIMUM_PIXELS`` over all cameras suffice too."""
 
@@ -207,7 +208,7 @@ class StreetWriter:
     _frames: dict[str, list[int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._bodies = BodyWriter(self.settings, self.world, MINIMUM_PIXELS)
+        self._bodies = BodyWriter(self.settings, self.world)
 
     def write_frame(self, frame: StreetFrame) -> None:
         if not self.settings.delays_known:
@@ -252,10 +253,8 @@ class StreetWriter:
     def _annotate(self, frame: StreetFrame) -> list[int]:
         """Record the boxes of this frame and return the annotated actors."""
         actors = self.world.actors
-        pixels, returns = np.zeros(len(actors), int), np.zeros(len(actors), int)
-        for image in frame.images:
-            pixels += _count(image.object_indices, len(actors))
-        returns += _count(frame.sweep.object_indices, len(actors))
+        pixels = sum(_count(image.object_indices, len(actors)) for image in frame.images)
+        returns = _count(frame.sweep.object_indices, len(actors))
         seen = (pixels >= MINIMUM_PIXELS) | (returns >= MINIMUM_RETURNS)
         ego = frame.world_from_ego[:2, 3]
         annotated = [

@@ -76,11 +76,6 @@ class TunnelLight(Weather):
         return mix(column(_LIGHT_BELOW), column(_LIGHT_ABOVE), np.float32(0.5) + np.float32(0.5) * normals[2])
 
 
-def tunnel_light(seed: int) -> TunnelLight:
-    """Return the light of a tunnel under the weather of a seed."""
-    return TunnelLight(**vars(random_weather(seed)))
-
-
 def tunnel(seed: int, end: float) -> list[Part]:
     """Return walls on both sides, a ceiling and two ends around a drive of ``end`` meters, closed on all sides."""
     rng = stream(seed, "tunnel")
@@ -150,7 +145,8 @@ class Path(Way):
     rest_heading: float = 0.0
 
     def position(self, time: float) -> tuple[float, float]:
-        return self.start + self.speed * time, self.y + self.shift * self._eased(time)
+        s = self._phase(time)
+        return self.start + self.speed * time, self.y + self.shift * (s * s * (3 - 2 * s))
 
     def heading(self, time: float) -> float:
         """Return the angle of the path's tangent from +x, radians."""
@@ -165,16 +161,10 @@ class Path(Way):
         return abs(self.speed) * time
 
     def pose(self, time: float, height: float) -> Pose:
-        """Return world from object, with the object's origin ``height`` meters above the road."""
-        x, y = self.position(time)
-        return at(x, y, height, self.heading(time))
+        return at(*self.position(time), height, self.heading(time))
 
     def _phase(self, time: float) -> float:
         return float(np.clip((time - self.shift_time) / self.shift_duration + 0.5, 0, 1))
-
-    def _eased(self, time: float) -> float:
-        s = self._phase(time)
-        return s * s * (3 - 2 * s)
 
 
 @dataclass(frozen=True)
@@ -198,11 +188,9 @@ class Crossing(Way):
         return self.x, self.start + float(np.copysign(self.traveled(time), self.end - self.start))
 
     def traveled(self, time: float) -> float:
-        """Return meters walked by then."""
         return float(np.clip(self.speed * (time - self.at), 0, abs(self.end - self.start)))
 
     def pose(self, time: float, height: float) -> Pose:
-        """Return world from object, with the object's origin ``height`` meters above the road."""
         return at(*self.position(time), height, float(np.copysign(np.pi / 2, self.end - self.start)))
 
 
@@ -267,7 +255,9 @@ def build_world(settings: StreetSettings) -> World:
     end = settings.ego_speed * settings.duration
     seed = settings.seed
     beside = tunnel(seed, end) if settings.tunnel else [*_houses(seed, end), *_footway_things(seed, end)]
-    weather = tunnel_light(seed) if settings.tunnel else random_weather(seed)
+    weather = random_weather(seed)
+    if settings.tunnel:
+        weather = TunnelLight(**vars(weather))
     actors = [
         *_parked_cars(settings, end),
         *_moving_cars(settings, ego),

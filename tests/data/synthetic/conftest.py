@@ -7,7 +7,7 @@ import pytest
 
 from tests.conftest import unchecked
 
-OF_WHOLE_STREETS = ("test_bodies", "test_lens", "test_reader", "test_same_street", "test_street", "test_truth")
+OF_WHOLE_STREETS = ("test_reader", "test_street")
 
 
 @pytest.fixture(autouse=True, scope="module")
