@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import get_args
 
@@ -48,14 +49,10 @@ def seconds_of(views: RecordedViews, frame_rate: float) -> float:
     """How many seconds of the log normalized time 0 to 1 is: by its clock, else at so many frames a second."""
     with_clock = [view for view in views.all if view.seconds is not None]
     if with_clock:
-        first, last = min(with_clock, key=_time), max(with_clock, key=_time)
+        first, last = min(with_clock, key=attrgetter("time")), max(with_clock, key=attrgetter("time"))
         if last.time > first.time and last.seconds is not None and first.seconds is not None:
             return (last.seconds - first.seconds) / (last.time - first.time)
     return frame_periods(views.all) / frame_rate
-
-
-def _time(view: View) -> float:
-    return view.time
 
 
 @dataclass(frozen=True)

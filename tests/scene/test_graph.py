@@ -2,27 +2,12 @@ from dataclasses import replace
 
 import pytest
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
-from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes import Background, Rigid
-from sparsestreet.scene.state import SceneState
+from sparsestreet.scene.nodes import Rigid
 from sparsestreet.types import Shutter
-from tests.scene.street import (
-    background,
-    background_settings,
-    degree,
-    keyframes,
-    pose,
-    random_rows,
-    rigid,
-    static_mask,
-    track,
-    view_at,
-)
+from tests.scene.street import background, degree, keyframes, pose, random_rows, rigid, static_mask, track, view_at
 from tests.typed import there
 
 MASK = static_mask(sparsity_weight=0.25)
@@ -64,31 +49,6 @@ def test_empty_nodes(counts: tuple[int, int]):
 def test_no_nodes_are_an_error():
     with pytest.raises(ValueError, match="at least one node"):
         SceneGraph({})
-
-
-class Heavy(Background):
-    """A node with two terms of its own."""
-
-    def own_regularizers(
-        self, raw: RawGaussians, drawn: Bool[Tensor, " n"], state: SceneState
-    ) -> dict[str, torch.Tensor]:
-        return {"weight": self.rows.means.sum(), "age": torch.tensor(state.progress)}
-
-
-def test_regularizers_are_named_by_node_and_term():
-    heavy = Heavy(background_settings(), random_rows(3, 2))
-    scene = SceneGraph({"road": background(random_rows(4, 0)), "heavy": heavy, "cars": cars(3)})
-    state = SceneState(progress=0.25, training=True)
-    parts = scene.gaussians_at(VIEW, state).parts
-    drawn = {name: torch.ones(len(part), dtype=torch.bool) for name, part in parts.items()}
-    terms = scene.regularizers(VIEW, parts, drawn, state)
-    assert list(terms) == ["heavy/weight", "heavy/age"]
-    assert terms["heavy/age"].item() == 0.25
-    assert torch.equal(terms["heavy/weight"], heavy.rows.means.sum())
-    torch.stack(list(terms.values())).sum().backward()
-    assert torch.equal(there(heavy.rows.means.grad), torch.ones(3, 3))
-    plain = SceneGraph({"road": scene.nodes["road"], "cars": scene.nodes["cars"]})
-    assert plain.regularizers(VIEW, parts, drawn, SceneState()) == {}
 
 
 def test_bytes_of_every_part():

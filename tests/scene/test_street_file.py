@@ -60,7 +60,7 @@ PARTS = {
     "affine": lambda: road(one=test_affine.affine(test_affine.MIXING)),
     "exposure": lambda: road(one=test_exposure.exposure()),
     "poses": lambda: road(one=corrected()),
-    "blur": lambda: test_motion_blur.street(one=test_motion_blur.blur(2)),
+    "blur": lambda: test_motion_blur.street(one=test_motion_blur.blur(3)),
 }
 
 

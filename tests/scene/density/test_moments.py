@@ -10,8 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.scene.density import DensityStatistics, GradientDensity
-from sparsestreet.scene.gaussians import RowPlan, Rows
+from sparsestreet.scene.density import GradientDensity
+from sparsestreet.scene.gaussians import Rows
 from tests.scene.density.scenes import make_rows, with_statistics
 from tests.scene.street import static_mask
 
@@ -88,12 +88,6 @@ class Simulation:
                 torch.testing.assert_close(state["exp_avg_sq"][index], row.second[name], rtol=1e-12, atol=1e-15)
 
 
-def densified(run: Simulation, density: GradientDensity, statistics: DensityStatistics) -> RowPlan:
-    return density.densify(
-        run.rows, statistics, radius=RADIUS, progress=0.5, max_gaussians=None, generator=run.generator
-    )
-
-
 def test_moments_through_densify_cull_reset_and_pruning():
     run = Simulation(7)
     run.train(4)
@@ -105,7 +99,9 @@ def test_moments_through_densify_cull_reset_and_pruning():
             run.rows.log_scales[row] = torch.tensor(scale).log()
         run.simulated[row].values["log_scales"] = torch.full((3,), scale).log().double()
     statistics = with_statistics([0.0, 0.0, 0.01, 0.0, 0.0, 0.01, 0.0], screens=[0.0, 0.5, 0, 0, 0, 0, 0])
-    plan = densified(run, GradientDensity(), statistics)
+    plan = GradientDensity().densify(
+        run.rows, statistics, radius=RADIUS, progress=0.5, max_gaussians=None, generator=run.generator
+    )
     run.rows.resize(plan, run.adam)
     statistics.resize(plan)
     clone, children = run.simulated[5].twin(), [run.simulated[2].twin(), run.simulated[2].twin()]
@@ -147,22 +143,6 @@ def test_moments_through_densify_cull_reset_and_pruning():
     run.train(3)
     run.check()
     assert len(run.adam.state) == sum(len(group["params"]) for group in run.adam.param_groups) == 7
-
-
-def test_replaced_parents_leave_no_moments_behind():
-    run = Simulation(3)
-    run.train(2)
-    with torch.no_grad():
-        run.rows.log_scales.zero_()  # 1 m, large
-    statistics = with_statistics([0.0, 0.01, 0.0])
-    plan = densified(run, GradientDensity(keep_parent=False), statistics)
-    run.rows.resize(plan, run.adam)
-    assert plan.source.tolist() == [0, 2, 1, 1]
-    for name, parameter in run.rows.named_parameters():
-        moments = run.adam.state[parameter]["exp_avg"]
-        assert not moments[2:].any(), name
-        expected = torch.stack([run.simulated[row].first[name] for row in (0, 2)])
-        torch.testing.assert_close(moments[:2], expected, rtol=1e-12, atol=1e-15)  # float64 round-off
 
 
 @pytest.mark.parametrize(("steady", "rates"), [(True, 1.0), (False, 31.6)])

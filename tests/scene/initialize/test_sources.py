@@ -105,13 +105,7 @@ def test_points_of_the_log_are_points_from_images():
     seeds = drawn(ImagePoints(smallest_pixels=2.0, largest_pixels=5.0), 9, alone)
     assert torch.equal(seeds.points.positions, positions)
     assert torch.equal(seeds.points.colors, sparse.colors)
-    cameras = [view.camera for view in alone.views]
-    sizes = torch.tensor(
-        [
-            min(float((camera.position - at).norm()) / float(camera.intrinsics[0, 0]) for camera in cameras)
-            for at in positions
-        ]
-    )
+    sizes = pixel_sizes(positions, alone.views)
     torch.testing.assert_close(seeds.smallest, 2 * sizes)
     torch.testing.assert_close(seeds.largest, 5 * sizes)
     both = replace(alone, image_points=StreetPoints(ten_points(), {}))
@@ -225,20 +219,20 @@ def test_returns_from_moving_objects_if_no_box_is_cut_out():
     assert len(drawn(LidarPoints(), 10_000, data)) <= inside - 5 * 60
 
 
+def seeds_of(*values: float) -> Seeds:
+    """Each field has numbers of its own."""
+    each = torch.tensor(values)
+    across = each[:, None].expand(-1, 3)
+    return Seeds(Points(across, across + 10), each + 20, each + 30, each + 40, each + 50, across + 60)
+
+
 def test_seeds_of_several_sources_follow_each_other():
-    points, twice = Points(torch.ones(2, 3), torch.zeros(2, 3)), torch.ones(2)
-    one = Seeds(points, twice, 2 * twice, 0.3 * twice, 0.2 * twice, torch.zeros(2, 3))
-    white = Points(torch.zeros(1, 3), torch.ones(1, 3))
-    two = Seeds(white, torch.zeros(1), torch.ones(1), torch.tensor([0.4]), torch.ones(1), torch.ones(1, 3))
-    both = Seeds.concatenate([one, two])
-    assert both.points.positions[:, 0].tolist() == [1, 1, 0]
-    assert both.points.colors[:, 0].tolist() == [0, 0, 1]
-    assert (both.smallest.tolist(), both.largest.tolist()) == ([1, 1, 0], [2, 2, 1])
-    assert both.opacities.tolist() == pytest.approx([0.3, 0.3, 0.4])
-    assert both.times.tolist() == pytest.approx([0.2, 0.2, 1.0])
-    assert both.normals[:, 0].tolist() == [0, 0, 1]
-    assert both.where(torch.tensor([False, True, True])).normals[:, 0].tolist() == [0, 1]
-    assert len(both) == 3
+    both = Seeds.concatenate([seeds_of(1.0, 2.0), seeds_of(3.0)])
+    for found, expected in ((both, seeds_of(1.0, 2.0, 3.0)), (both.where(torch.arange(3) > 0), seeds_of(2.0, 3.0))):
+        assert len(found) == len(expected)
+        for name, value in {**vars(found), **vars(found.points)}.items():
+            if name != "points":
+                assert torch.equal(value, {**vars(expected), **vars(expected.points)}[name]), name
     assert len(Seeds.concatenate([])) == 0
 
 

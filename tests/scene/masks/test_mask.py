@@ -9,14 +9,7 @@ from torch import Tensor
 
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.masks import (
-    Mask,
-    MaskSettings,
-    SampledMaskSettings,
-    StaticMask,
-    StaticMaskSettings,
-    TemporalMaskSettings,
-)
+from sparsestreet.scene.masks import Mask, SampledMaskSettings, StaticMask, StaticMaskSettings, TemporalMaskSettings
 from sparsestreet.scene.nodes import Background
 from tests.scene.masks.stub import RisingMask, RisingSettings
 from tests.scene.street import (
@@ -50,15 +43,6 @@ def masked(mask: Mask, count: int = 9) -> Background:
 
 def opacities(node: Background, time: float) -> Tensor:
     return node.gaussians_at(view_at(time), degree(1)).opacities
-
-
-def test_the_contract():
-    assert isinstance(static_mask(), Mask)
-    assert isinstance(StaticMaskSettings(1.0), MaskSettings)
-    assert isinstance(RisingSettings(), MaskSettings)
-    assert not isinstance(static_mask(), MaskSettings)
-    with pytest.raises(TypeError, match="abstract"):
-        Mask()  # pyright: ignore[reportAbstractUsage]
 
 
 @both

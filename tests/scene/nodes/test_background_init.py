@@ -11,7 +11,6 @@ from sparsestreet.scene.initialize.sources import LidarPoints, NearPoints
 from sparsestreet.scene.nodes import Background, BackgroundSettings, RigidSettings
 from sparsestreet.triangulation import StreetPoints
 from tests.scene.street import (
-    CAR_COLOR,
     NUM_FRAMES,
     ROAD_COLOR,
     SOURCES,
@@ -50,24 +49,6 @@ def test_lidar_outside_moving_boxes_keeps_its_color():
         inside = (in_box.abs() < driving.size / 2).all(1)
         assert inside.any()
         assert not set(map(tuple, world_points[inside].tolist())) & set(map(tuple, node.rows.means.tolist()))
-
-
-def test_what_does_not_move_or_is_of_another_class_stays():
-    everything = sum(int(sweep.colored.sum()) for sweep in street_log().sweeps)
-    assert len(build(LIDAR_ONLY, movers=replace(MOVERS, min_path_length=100.0)).rows) == everything
-    assert len(build(LIDAR_ONLY, movers=replace(MOVERS, classes=("Tram",))).rows) == everything
-    # Cars only: the driving one is cut out; the cyclist's box takes no points of its own away.
-    cars = build(LIDAR_ONLY, movers=replace(MOVERS, classes=("Car",)))
-    assert len(build(LIDAR_ONLY).rows) <= len(cars.rows) < everything
-    assert not (colors(cars) - torch.tensor(CAR_COLOR)).abs().max(dim=1).values.lt(1e-3).any()
-
-
-def test_held_out_sweeps_are_not_used():
-    held_out = frozenset({1, 3})
-    means = set(map(tuple, build(LIDAR_ONLY, held_out).rows.means.tolist()))
-    for sweep in street_log().sweeps:
-        shared = means & set(map(tuple, sweep.points.tolist()))
-        assert bool(shared) == (sweep.index not in held_out)
 
 
 def test_the_number_of_points_of_each_kind():
