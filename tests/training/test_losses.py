@@ -303,14 +303,14 @@ def test_smoothness_of_inverse_depth_equals_kornias(generator):
 
 
 def test_what_is_not_drawn_is_no_step_of_depth():
-    """Two depths side by side, and nothing in the lower rows: one column of steps counts."""
+    """Two depths side by side, and nothing in the first and the lower rows: one column of steps counts."""
     depth = torch.full((HEIGHT, WIDTH), 2.0, dtype=torch.float64)
     depth[:, 8:] = 4.0
-    depth[5:] = 0.0
+    depth[0] = depth[5:] = 0.0
     depth.requires_grad_()
     flat = replace(frame(), image=torch.full((HEIGHT, WIDTH, 3), 7, dtype=torch.uint8))
     loss = InverseDepthSmoothness(weight=1.0)(rendering(depth=depth), flat, SCENE)
-    assert loss.item() == pytest.approx(5 * 0.25 / (HEIGHT * (WIDTH - 1)), rel=1e-4)  # 1e-5 m of 2 m
+    assert loss.item() == pytest.approx(4 * 0.25 / (HEIGHT * (WIDTH - 1)), rel=1e-4)  # 1e-5 m of 2 m
     loss.backward()
     assert bool(depth.grad.isfinite().all())
     assert depth.grad.abs().sum(0).nonzero().squeeze(1).tolist() == [7, 8]

@@ -10,7 +10,7 @@ from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.nodes import Node
 from sparsestreet.training.callbacks import DensityControl
 from sparsestreet.training.schedule import Interval
-from tests.training.callbacks.refining import every_ten, started
+from tests.training.callbacks.refining import asked_at, every_ten, started
 from tests.training.stubs import AskedStrategy, StubTrainer, background, frame_at, make_system
 
 KEEPS_ALL = GradientDensity(grad_threshold=1e9, cull_opacity=0.0, cull_scale=1e9)
@@ -58,6 +58,20 @@ def test_a_resumed_run_goes_on_as_the_uninterrupted_one(tmp_path):
     assert len(node.rows) > 40
     for name, column in node.rows.columns().items():
         assert torch.equal(resumed_node.rows.columns()[name], column), name
+
+
+def test_a_pause_outlives_a_resume():
+    resets = Interval(0.3, 0.3, every=10)
+    trainer, _, _ = started(control := every_ten(resets, pause=20), background=background(4, density=AskedStrategy()))
+    trainer.walk(34)
+    strategy = AskedStrategy()
+    resumed = every_ten(resets, pause=20)
+    later = StubTrainer(make_system({"background": background(4, density=strategy)}), [resumed])
+    resumed.load_state_dict(control.state_dict())
+    later.global_step = 34
+    later.start()
+    later.walk(70)
+    assert asked_at(strategy, "cull") == [60, 70]
 
 
 def test_a_state_has_the_number_of_rows_of_its_moment():
