@@ -20,7 +20,7 @@ BACKWARD = ["decompose_pixels", "blend_tiles_backward", "sum_slots", "project_ro
 CALLS, LAUNCHES, PYTHON = 25, 8, 230
 """Most calls of torch in a forward pass with a background, allocations and views too, most launches, and most calls of
 Python's functions."""
-CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
+CASE = {"terms": 1, "pairs": 100_003, "background": True}
 DAILY = CASE | {"width": 1920, "height": 1280}
 SLOW = [
     CASE | {"width": 1600, "height": 900, "terms": 16},
