@@ -132,19 +132,6 @@ def test_17_neighboring_depths_are_told_apart(backend, dtype):
 
 @pytest.mark.slow_if_interpreted
 @every_backend
-def test_17_the_order_of_rows_does_not_matter_without_ties(backend):
-    view = camera(37, 29)
-    gaussians = random_gaussians(80, view)
-    order = torch.randperm(80, generator=torch.Generator().manual_seed(0))
-    shuffled = Gaussians(*(getattr(gaussians, name)[order] for name in FIELDS))
-    plain, other = (render(scene, view, backend, torch.float32) for scene in (gaussians, shuffled))
-    assert torch.equal(plain.images["rgb"], other.images["rgb"])
-    for name in FIELDS:
-        torch.testing.assert_close(plain.gradients[name][order], other.gradients[name], rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.slow_if_interpreted
-@every_backend
 def test_18_two_runs_are_bitwise_equal(backend):
     view = camera(37, 29)
     gaussians = random_gaussians(80, view)
