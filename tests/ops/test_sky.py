@@ -16,7 +16,7 @@ from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.phases import PhaseRecorder, WallClock
 from sparsestreet.types import Camera
-from tests.ops.scenes import device_of, every_fast_precision, relative_error, with_threads
+from tests.ops.scenes import device_of, every_fast_precision, fill_buffers_with_nan, relative_error, with_threads
 
 NAMES = ("rgb", "alpha", "texels")
 LIMIT = 0.25
@@ -89,8 +89,7 @@ def test_all_sky_and_none(monkeypatch, backend, dtype, alpha):
     """Every output is written: buffers hold NaN before."""
     view = camera(11, 7)
     given = image(view, 5) | {"alpha": torch.full((7, 11), alpha).double()}
-    empty_like = torch.empty_like
-    monkeypatch.setattr(torch, "empty_like", lambda *a, **k: empty_like(*a, **k).fill_(torch.nan))
+    fill_buffers_with_nan(monkeypatch)
     if alpha == 0:
         assert_matches_torch(given, view, backend, dtype)
         return
