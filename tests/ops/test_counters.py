@@ -141,12 +141,6 @@ def test_against_images_without_the_row(backend, behind):
     torch.testing.assert_close(found.squared_change.cpu().double(), squared.sum((1, 2)), rtol=rtol, atol=atol)
 
 
-def test_weights_of_another_shape_are_refused():
-    view = camera(5, 4)
-    with pytest.raises(ValueError, match="pixel_weights"):
-        leave_one_out(random_gaussians(3, view), view, pixel_weights=torch.ones(5, 4, dtype=torch.float64))
-
-
 @every_backend
 def test_no_rows(backend):
     rows, view = of(backend, random_gaussians(0, camera(5, 4))), camera(5, 4)

@@ -10,6 +10,7 @@ from triton.compiler import CompiledKernel
 from triton.runtime.jit import KernelInterface
 
 from sparsestreet.ops.triton import launch
+from tests.ops.triton.launch_alike import KINDS
 from tests.ops.triton.recording import run_compiler
 
 FORWARD = [
@@ -76,17 +77,11 @@ def test_every_kernel_compiles_for_other_sizes():
         assert len(found["dispatches"]) <= 6
 
 
-KINDS = [
-    "plain", "another plain", "unaligned target", "unaligned source", "doubles", "one", "sixteens", "zero", "long",
-    "least int", "long sixteens", "float", "count of one", "other constant", "other block", "other options",
-]  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def launched() -> dict[str, list[dict]]:
     """By version of Triton: what each launch got."""
     # An unknown one first: what a known one has bound is not bound again.
-    return run_compiler("launch_alike", {"3.12.0": ["plain", "plain"], "": KINDS * 3})
+    return run_compiler("launch_alike", {"3.12.0": ["plain", "plain"], "": [*KINDS] * 3})
 
 
 @pytest.fixture(scope="module")
