@@ -46,7 +46,9 @@ def check(case: dict, found: dict) -> None:
     assert {kernel["name"] for kernel in found["compiled"]} <= set(names)
     for kernel in found["compiled"]:
         sizes = expected(kernel["name"], case["width"], case["height"])
-        assert kernel["spilled"] == kernel["tensor_core"] == kernel["atomics"] == 0, kernel
+        # As in test_machine_code.py: the forward blend spills outside of its loop.
+        assert kernel["spilled"] <= 8 * (kernel["name"] == "blend_tiles"), kernel
+        assert kernel["tensor_core"] == kernel["atomics"] == 0, kernel
         assert kernel["shared"] <= 48 << 10, kernel
         # One number for each row, which fits 32 bits.
         assert kernel["types"].get("places", "*i32") == "*i32"
