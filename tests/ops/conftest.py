@@ -10,6 +10,7 @@ import torch
 
 from sparsestreet.ops.backend import has_triton
 from tests.conftest import unchecked
+from tests.ops.scenes import fill_buffers_with_nan
 
 INTERPRETED = has_triton() and not torch.cuda.is_available()
 if INTERPRETED:
@@ -29,6 +30,12 @@ def _unknown_views() -> None:
     capacity = sys.modules.get("sparsestreet.ops.triton.lists")
     if capacity is not None:
         capacity._seen.clear()
+
+
+@pytest.fixture
+def poisoned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing may be read before it is written."""
+    fill_buffers_with_nan(monkeypatch)
 
 
 ON_NUMBERS = ("test_hard_", "test_effects_", "test_guards_drawn", "test_properties")

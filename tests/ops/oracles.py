@@ -62,6 +62,15 @@ def rotation_matrix(q: np.ndarray) -> np.ndarray:
     return np.eye(3) + 2 * w * skew + 2 * skew @ skew
 
 
+def brown_conrady(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
+    """Where a lens k1, k2, p1, p2, k3 shows normalized coordinates; [.., 2]."""
+    k1, k2, p1, p2, k3 = coefficients
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    x_d = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    return np.stack((x_d, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y), -1)
+
+
 def fitted_splat(alpha: Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance, in pixels, of the one splat that made this float64 image (no cut-off, no clamp acting).
 

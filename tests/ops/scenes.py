@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.ops.backend import has_triton
-from sparsestreet.ops.cpu.library import find_library
+from sparsestreet.ops.cpu.library import find_library, idle_workspaces
 from sparsestreet.types import Camera, Gaussians
 
 Answer = TypeVar("Answer")
@@ -196,14 +196,18 @@ def with_threads(counts: tuple[int, ...], call: Callable[[], Answer]) -> list[An
 
 
 def fill_buffers_with_nan(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is allocated without a value holds NaN (1, if it holds whole numbers) from now on."""
+    """What is allocated without a value holds NaN, or its largest whole number, from now on; so do idle workspaces."""
 
     def filled(empty: Callable[..., Tensor]) -> Callable[..., Tensor]:
         def call(*arguments, **options) -> Tensor:
             tensor = empty(*arguments, **options)
-            return tensor.fill_(torch.nan if tensor.is_floating_point() else 1)
+            if tensor.is_floating_point() or tensor.dtype == torch.bool:
+                return tensor.fill_(torch.nan)
+            return tensor.fill_(torch.iinfo(tensor.dtype).max)
 
         return call
 
-    monkeypatch.setattr(torch, "empty_like", filled(torch.empty_like))
-    monkeypatch.setattr(torch.Tensor, "new_empty", filled(torch.Tensor.new_empty))
+    for workspace in idle_workspaces():
+        workspace.poison()
+    for owner, name in ((torch, "empty"), (torch, "empty_like"), (torch.Tensor, "new_empty")):
+        monkeypatch.setattr(owner, name, filled(getattr(owner, name)))

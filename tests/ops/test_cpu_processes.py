@@ -1,16 +1,13 @@
 """The C++ backend in other processes: forked and spawned workers, and loaded before torch."""
 
-import os
-import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from sparsestreet.ops.cpu.library import find_library
+from tests.ops.test_cpu_compilers import run
 
 pytestmark = pytest.mark.slow
-ROOT = Path(__file__).parents[2]
 SCENE = """
 import torch
 from sparsestreet.ops import splat
@@ -58,20 +55,11 @@ assert (torch.full((1 << 22,), 1e-40) * 0.5 > 0).all()
 """
 
 
-def run(script: Path, text: str, *arguments: str) -> None:
-    script.write_text(text)
-    command = [sys.executable, str(script), *arguments]
-    # Packages, too, may be found by PYTHONPATH.
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
-    answer = subprocess.run(
-        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=180, check=False
-    )
-    assert answer.returncode == 0, answer.stderr
-
-
 def test_loaded_after_torch_and_in_forked_and_spawned_processes(tmp_path):
-    run(tmp_path / "script.py", SCENE + SUBNORMALS + WORKER)
+    script = tmp_path / "script.py"  # which a spawned worker imports
+    script.write_text(SCENE + SUBNORMALS + WORKER)
+    run(sys.executable, str(script))
 
 
 def test_loaded_before_torch(tmp_path):
-    run(tmp_path / "script.py", LOADED_FIRST + SCENE + SUBNORMALS, str(find_library()))
+    run(sys.executable, "-c", LOADED_FIRST + SCENE + SUBNORMALS, str(find_library()))

@@ -7,7 +7,7 @@ import torch
 
 from sparsestreet.bench.scenes import BenchScene, Size, bench_scenes, seen_through
 from sparsestreet.bench.timing import GROUPS, Cotangent, last_workspace, leaves
-from sparsestreet.ops import SplatSettings, contribution
+from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.cpu.rasterizer import rasterize
 from tests.typed import there
 
@@ -47,10 +47,3 @@ def test_splats_that_end_too_early_are_found():
     """As if the lists ended at an alpha of 1/128 where the pixel loop ends at 1/255."""
     tight = drawn(SCENES[0], replace(SplatSettings(), alpha_min=1 / 128), False)[0]
     assert not torch.equal(tight[0], drawn(SCENES[0], SplatSettings(), True)[0][0])
-
-
-@pytest.mark.parametrize("scene", SCENES, ids=[scene.name for scene in SCENES])
-def test_touched_pixels_are_those_of_the_dense_reference(scene):
-    doubled = leaves(scene.gaussians, torch.float64)
-    fast, dense = (contribution(doubled, scene.camera, backend=name) for name in ("cpu", "reference"))
-    assert torch.equal(fast.pixels, dense.pixels)

@@ -11,7 +11,7 @@ import torch
 from sparsestreet.geometry.quaternions import from_matrix
 from sparsestreet.ops import SplatSettings, guards, splat
 from sparsestreet.types import Camera, Gaussians
-from tests.ops.oracles import fitted_splat, rotation_matrix
+from tests.ops.oracles import brown_conrady, fitted_splat, rotation_matrix
 from tests.ops.scenes import (
     camera,
     cast,
@@ -31,14 +31,6 @@ WIDE = (-0.25, 0.08, 2e-3, -1e-3, -0.012)
 
 def through(view: Camera, coefficients: tuple[float, ...]) -> Camera:
     return dataclasses.replace(view, distortion=torch.tensor(coefficients, dtype=torch.float64))
-
-
-def brown_conrady(x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    k1, k2, p1, p2, k3 = coefficients
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    x_d = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    return np.stack((x_d, y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y), -1)
 
 
 @cache

@@ -91,18 +91,27 @@ def test_triton_that_cannot_run(monkeypatch):
         fused_backend("triton", torch.zeros(3))
 
 
-@pytest.mark.parametrize("backend", ["cpu", "triton"])
+@pytest.mark.parametrize("backend", ["cpu", "triton", "auto"])
 @pytest.mark.parametrize("step", STEPS)
 def test_the_named_implementation_runs(monkeypatch, step, backend):
-    # Torch's numbers would be as good.
+    """On the CPU "auto" takes the library. Torch's numbers would be as good."""
     ran = RuntimeError(f"{backend} ran")
 
     def run(*_, **__):
         raise ran
 
-    monkeypatch.setattr(f"sparsestreet.ops.{PLACES[step][backend]}", run)
+    monkeypatch.setattr(f"sparsestreet.ops.{PLACES[step].get(backend, PLACES[step]['cpu'])}", run)
     with pytest.raises(RuntimeError, match=str(ran)):
         STEPS[step](backend)
+
+
+@pytest.mark.parametrize("step", STEPS)
+def test_what_is_not_there_is_an_error(monkeypatch, step):
+    monkeypatch.setattr(fused, "find_library", lambda: None)
+    with pytest.raises(RuntimeError, match=r"'cpu' needs the C\+\+ library: install a C\+\+17 compiler"):
+        STEPS[step]("cpu")
+    with pytest.raises(ValueError, match=r"no backend 'cuda' of this step: choose one of .*'cpu'"):
+        STEPS[step]("cuda")
 
 
 def test_a_named_implementation_refuses_what_it_does_not_take(on_gpu):

@@ -97,10 +97,10 @@ def test_24_expected_depth_of_a_faint_splat(backend, dtype):
 
 
 @pytest.mark.slow_if_interpreted
-@pytest.mark.parametrize("opacities", [(0.02, 0.3), (0.9, 1.0)], ids=["translucent", "opaque"])
+@pytest.mark.parametrize("opacities", [(0.02, 0.3), (0.9, 1.0), (0.999, 1.0)], ids=["translucent", "opaque", "closed"])
 @every_fast_backend
 def test_26_deep_stacks(backend, opacities):
-    # 400 splats in every pixel; transmittance falls to 1e-30 where nothing stops it.
+    # 400 splats in every pixel; transmittance falls to 1e-30 where nothing stops it, and would to 1e-800.
     generator = torch.Generator().manual_seed(4)
     n, low, high = 400, *opacities
 

@@ -69,6 +69,26 @@ def test_03_04_needles_in_float32(backend, ratio, orientation):
         assert relative_error(result.gradients[name], truth.gradients[name]) < bar, name
 
 
+@pytest.mark.parametrize("length", [1e-2, 1e-1])
+def test_04_needles_in_any_direction(length):
+    # The scales' gradient of some needles nearly vanishes, so that their relative error has no bound; against what such
+    # needles usually have, the error is small for all of them. What is left is the rounding of the mean: 2e-6 px at
+    # pixel 28, times a slope of alpha of up to 5 per pixel.
+    view, errors, norms = front_camera(48, 40, 40.0), [], []
+    for seed in range(24):
+        generator = torch.Generator().manual_seed(seed)
+        needle = one_gaussian(
+            quaternions=[torch.randn(4, generator=generator).tolist()],
+            scales=torch.tensor([[length, 1e-4, 1e-4]], dtype=torch.float32).double().tolist(),
+            means=torch.tensor([[0.2, -0.1, 2.0]], dtype=torch.float32).double().tolist(),
+            opacities=[0.75],
+        )
+        truth, result = (render(needle, view, "cpu", dtype) for dtype in (torch.float64, torch.float32))
+        errors.append(float((result.gradients["scales"] - truth.gradients["scales"]).norm()))
+        norms.append(float(truth.gradients["scales"].norm()))
+    assert max(errors) < 4e-5 * sorted(norms)[len(norms) // 2]
+
+
 @pytest.mark.slow_if_interpreted
 @every_backend
 def test_04_exponent_far_along_a_needle(backend):
@@ -102,38 +122,26 @@ def test_06_through_the_near_plane(backend, dtype):
 
 
 @every_precision
-def test_06_camera_inside_a_splat(backend, dtype):
+@pytest.mark.parametrize("depth", [0.0, 0.3])
+def test_06_camera_inside_a_splat(backend, dtype, depth):
     view = front_camera(21, 13, 20.0)
-    assert render(one_gaussian(means=[[0.0, 0.0, 0.0]], scales=[[3.0] * 3]), view, backend, dtype).is_finite()
-    assert render(one_gaussian(means=[[0.0, 0.0, 0.3]], scales=[[3.0] * 3]), view, backend, dtype).is_finite()
+    assert render(one_gaussian(means=[[0.0, 0.0, depth]], scales=[[3.0] * 3]), view, backend, dtype).is_finite()
 
 
 @every_backend
-def test_13_antialias_of_tiny_splats(backend):
-    # Scales of 1e-6 m two meters ahead: det / det_blurred = 2e-18, far below where float32 has correct digits.
+@pytest.mark.parametrize("scale", [0.018, *first_interpreted(1e-6, 1e-4, 1e-2, 0.0, 1e-20, 4.4e-3, 8.1e-3)])
+def test_13_antialias_of_tiny_splats(backend, scale):
+    """A ball's alpha at its mean is 0.8 of the compensation, and its size's gradient that of the float64 reference.
+
+    1e-6 m two meters ahead: det / det_blurred = 2e-18, far below where float32 has correct digits."""
     view = front_camera(5, 5, 40.0)
     settings = SplatSettings(antialias=True, alpha_min=1e-6)
-    for scale in (1e-2, 1e-4, 1e-6, 1e-20, 0.0):
-        # 20 px/m: sigma = 20 scale; ratio = (sigma^2 / (sigma^2 + 0.3))^2, with floor 0.005^2.
-        factor = max(0.005, (20 * scale) ** 2 / ((20 * scale) ** 2 + 0.3))
-        _check_compensation(backend, scale, factor, view, settings)
-
-
-@every_backend
-@pytest.mark.parametrize("ratio", first_interpreted(1e-4, 1e-3, 1e-2, 1e-1))
-def test_13_antialias_above_its_floor(backend, ratio):
-    # sigma^2 / (sigma^2 + 0.3) = sqrt(ratio), at 20 px/m; the floor is a ratio of 2.5e-5.
-    factor = math.sqrt(ratio)
-    scale = math.sqrt(0.3 * factor / (1 - factor)) / 20
-    _check_compensation(backend, scale, factor, front_camera(5, 5, 40.0), SplatSettings(antialias=True, alpha_min=1e-6))
-
-
-def _check_compensation(backend: str, scale: float, factor: float, view: Camera, settings: SplatSettings) -> None:
-    """A ball's alpha at its mean is 0.8 ``factor``, and the gradient of its size that of the float64 reference."""
+    # 20 px/m: sigma = 20 scale; ratio = (sigma^2 / (sigma^2 + 0.3))^2, with floor 0.005^2.
+    factor = max(0.005, (20 * scale) ** 2 / ((20 * scale) ** 2 + 0.3))
     ball = one_gaussian(scales=[[scale] * 3])
     truth = render(ball, view, "reference", torch.float64, settings)
     result = render(ball, view, backend, torch.float32, settings)
-    assert result.is_finite(), scale
+    assert result.is_finite()
     assert (result.images["alpha"] - truth.images["alpha"]).abs().max() < 1e-6
     assert float(result.images["alpha"][2, 2]) == pytest.approx(0.8 * factor, rel=1e-5)
     assert guards(ball, view, settings=settings).compensation_held == (factor == 0.005)

@@ -1,12 +1,9 @@
 """Culling, sorting, tile lists and memory (docs/stability.md; the number in a name is the row there)."""
 
-import math
-
 import pytest
 import torch
 
 from sparsestreet.ops import SplatSettings, contribution, leave_one_out
-from sparsestreet.ops.cpu.library import idle_workspaces
 from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     FIELDS,
@@ -16,6 +13,7 @@ from tests.ops.scenes import (
     every_backend,
     every_fast_precision,
     every_precision,
+    fill_buffers_with_nan,
     front_camera,
     one_gaussian,
     random_gaussians,
@@ -41,23 +39,6 @@ def test_15_nothing_to_draw(backend, dtype, width, height):
         assert result.gradients["background"].all()
 
 
-def _poison(patch: pytest.MonkeyPatch) -> None:
-    """Every buffer of the library and every tensor that a backend fills starts as NaN, or as the largest integer."""
-
-    def poisoned(like):
-        def filled(*args, **kwargs):
-            tensor = like(*args, **kwargs)
-            return tensor.fill_(math.nan if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max)
-
-        return filled
-
-    for workspace in idle_workspaces():
-        workspace.poison()
-    patch.setattr(torch.Tensor, "new_empty", poisoned(torch.Tensor.new_empty))
-    for name in ("empty", "empty_like"):
-        patch.setattr(torch, name, poisoned(getattr(torch, name)))
-
-
 @pytest.mark.slow_if_interpreted
 @every_fast_precision
 @pytest.mark.parametrize("stop", ["inclusive", "exclusive"])
@@ -68,7 +49,7 @@ def test_16_nothing_is_read_before_it_is_written(backend, dtype, stop):
     scene = Gaussians.concatenate([random_gaussians(300, view), opaque, opaque, opaque])
     expected = render(scene, view, backend, dtype, settings)
     with pytest.MonkeyPatch.context() as patch:
-        _poison(patch)
+        fill_buffers_with_nan(patch)
         result = render(scene, view, backend, dtype, settings)
     for part in ("images", "gradients"):
         for name, value in getattr(expected, part).items():
@@ -98,7 +79,7 @@ def test_16_numbers_of_every_row_are_written(backend, dtype):
 
     expected = counted()
     with pytest.MonkeyPatch.context() as patch:
-        _poison(patch)
+        fill_buffers_with_nan(patch)
         result = counted()
     assert all(map(torch.equal, *drawn))
     for name, value in expected.items():
@@ -128,19 +109,6 @@ def test_17_neighboring_depths_are_told_apart(backend, dtype):
     ]
     center = render(Gaussians.concatenate(parts), front_camera(5, 5, 40.0), backend, dtype).images["rgb"][2, 2]
     assert center[1] == pytest.approx(1.28, rel=1e-5)
-
-
-@pytest.mark.slow_if_interpreted
-@every_backend
-def test_17_the_order_of_rows_does_not_matter_without_ties(backend):
-    view = camera(37, 29)
-    gaussians = random_gaussians(80, view)
-    order = torch.randperm(80, generator=torch.Generator().manual_seed(0))
-    shuffled = Gaussians(*(getattr(gaussians, name)[order] for name in FIELDS))
-    plain, other = (render(scene, view, backend, torch.float32) for scene in (gaussians, shuffled))
-    assert torch.equal(plain.images["rgb"], other.images["rgb"])
-    for name in FIELDS:
-        torch.testing.assert_close(plain.gradients[name][order], other.gradients[name], rtol=1e-5, atol=1e-7)
 
 
 @pytest.mark.slow_if_interpreted

@@ -61,7 +61,17 @@ def _listed_tiles(backend: str, card: Gaussians, view: Camera, dtype: torch.dtyp
     return None
 
 
-def _check_tiles(backend: str, dtype: torch.dtype, tiles: tuple[int, int], longest: list[float]) -> None:
+@pytest.mark.slow_if_interpreted
+@every_precision
+@pytest.mark.parametrize(
+    ("tiles", "longest"),
+    [
+        # The first ones reach further than the 8 tiles that a mask can hold.
+        pytest.param((37, 11), [150.0, 60.0] + 4 * [40.0, 20.0, 10.0, 4.0], marks=pytest.mark.lengthy),
+        ((5, 2), [20.0, 8.0]),
+    ],
+)
+def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend, dtype, tiles, longest):
     """Ellipses of random place, turn and thickness: brute force over all pixels and tiles of the image."""
     # The last tiles are cut.
     width, height = tiles[0] * 16 - 5, tiles[1] * 16 - 3
@@ -92,17 +102,3 @@ def _check_tiles(backend: str, dtype: torch.dtype, tiles: tuple[int, int], longe
         assert needed <= listed <= allowed
         clear_cases += needed == allowed
     assert clear_cases > 0.6 * len(longest) or listed is None
-
-
-@pytest.mark.lengthy
-@pytest.mark.slow_if_interpreted
-@every_precision
-def test_23_tiles_of_ellipses_on_a_grid_that_is_not_square(backend, dtype):
-    # The first ones reach further than the 8 tiles that a mask can hold.
-    _check_tiles(backend, dtype, (37, 11), [150.0, 60.0] + 4 * [40.0, 20.0, 10.0, 4.0])
-
-
-@pytest.mark.slow_if_interpreted
-@every_precision
-def test_23_tiles_of_a_few_ellipses(backend, dtype):
-    _check_tiles(backend, dtype, (5, 2), [20.0, 8.0])

@@ -3,14 +3,12 @@
 import dataclasses
 from functools import partial
 from types import ModuleType
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from sparsestreet.geometry.quaternions import from_rotation_vector, to_matrix
-from sparsestreet.ops import backend as fused
 from sparsestreet.ops import over_sky
 from sparsestreet.ops import sky as torch_sky
 from sparsestreet.ops.cpu import images as cpu
@@ -18,7 +16,7 @@ from sparsestreet.ops.cpu.library import load_library
 from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.phases import PhaseRecorder, WallClock
 from sparsestreet.types import Camera
-from tests.ops.scenes import device_of, every_fast_precision, relative_error, with_threads
+from tests.ops.scenes import device_of, every_fast_precision, fill_buffers_with_nan, relative_error, with_threads
 
 NAMES = ("rgb", "alpha", "texels")
 LIMIT = 0.25
@@ -91,8 +89,7 @@ def test_all_sky_and_none(monkeypatch, backend, dtype, alpha):
     """Every output is written: buffers hold NaN before."""
     view = camera(11, 7)
     given = image(view, 5) | {"alpha": torch.full((7, 11), alpha).double()}
-    empty_like = torch.empty_like
-    monkeypatch.setattr(torch, "empty_like", lambda *a, **k: empty_like(*a, **k).fill_(torch.nan))
+    fill_buffers_with_nan(monkeypatch)
     if alpha == 0:
         assert_matches_torch(given, view, backend, dtype)
         return
@@ -261,28 +258,10 @@ def test_the_backward_pass_is_a_phase():
     assert "sky backward" in recorder.stop()
 
 
-def test_auto_takes_what_is_fast(monkeypatch):
-    view = camera(9, 7)
-    given = {name: value.float() for name, value in image(view, 3).items()}
-
-    def automatic(**tensors: Any) -> Tensor:
-        return over_sky(**tensors, camera=view, transmittance_min=LIMIT)
-
-    assert torch.equal(automatic(**given), over_sky(**given, camera=view, transmittance_min=LIMIT, backend="cpu"))
-    half = {name: value.to(torch.bfloat16) for name, value in given.items()}
-    assert automatic(**half).dtype == torch.bfloat16
-    monkeypatch.setattr(fused, "find_library", lambda: None)
-    assert torch.equal(automatic(**given), over_sky(**given, camera=view, transmittance_min=LIMIT, backend="torch"))
-
-
 @pytest.mark.parametrize(
     ("changes", "backend", "said"),
     [
-        (
-            {"camera": camera(8, 7)},
-            "auto",
-            r"rgb must have shape \[7, 8, 3\] for an image of 8x7 pixels",
-        ),
+        ({"camera": camera(8, 7)}, "auto", r"rgb must have shape \[7, 8, 3\] for an image of 8x7 pixels"),
         ({"texels": torch.zeros(6, 0, 0, 3)}, "auto", r"texels must have shape \[6, 1, 1, 3\]"),
         ({"alpha": torch.zeros(7, 9).double()}, "auto", "share one dtype and device"),
         ({"camera": dataclasses.replace(camera(9, 7), intrinsics=-torch.eye(3))}, "auto", "positive focal lengths"),
@@ -294,14 +273,3 @@ def test_what_does_not_fit_is_an_error(changes, backend, said):
     given = {name: value.float() for name, value in image(view, 3).items()} | {"camera": view} | changes
     with pytest.raises(ValueError, match=said):
         over_sky(**given, transmittance_min=LIMIT, backend=backend)
-
-
-def test_what_the_library_does_not_take_is_an_error(monkeypatch):
-    view = camera(9, 7)
-    given = {name: value.bfloat16() for name, value in image(view, 3).items()}
-    with pytest.raises(ValueError, match=r"takes float32 or float64 tensors on the CPU, got .*use backend='torch'"):
-        over_sky(**given, camera=view, transmittance_min=LIMIT, backend="cpu")
-    monkeypatch.setattr(fused, "find_library", lambda: None)
-    given = {name: value.float() for name, value in given.items()}
-    with pytest.raises(RuntimeError, match=r"backend 'cpu' needs the C\+\+ library: install a C"):
-        over_sky(**given, camera=view, transmittance_min=LIMIT, backend="cpu")

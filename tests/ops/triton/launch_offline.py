@@ -4,11 +4,8 @@ Run as a script, without TRITON_INTERPRET: cases come in as JSON on standard inp
 """
 
 import json
-import statistics
 import sys
-import time
 from contextlib import nullcontext
-from types import ModuleType
 from typing import Any
 
 import torch
@@ -16,13 +13,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sparsestreet.host_copy import HostCopy
 from sparsestreet.ops import splat, validate
-from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
-from sparsestreet.ops.triton.launch import launch
+from sparsestreet.ops.triton import rasterizer, screen
 from tests.ops.scenes import camera, cast, random_gaussians
 from tests.ops.triton.compile_offline import forbidden_in, instructions_of, resources_of
 from tests.ops.triton.fake_driver import Binary, FakeDevice, install
 
-MODULES: tuple[ModuleType, ...] = (screen, lists, parts, pixels, rasterizer, pixels)
 ROWS, VISIBLE = 40, 30
 _ALLOCATIONS = ("empty", "new_empty", "empty_like", "empty_strided", "new_empty_strided")
 
@@ -85,25 +80,6 @@ def found_in(binaries: list[Binary], arch: int) -> list[dict]:
     ]
 
 
-def launch_time(case: Case, repeats: int) -> float:
-    """Microseconds that a forward and a backward pass spend in their launches, median."""
-    spent = [0.0]
-
-    def timed(*arguments: Any, **options: Any) -> None:
-        start = time.perf_counter()
-        launch(*arguments, **options)
-        spent[-1] += time.perf_counter() - start
-
-    for module in MODULES:
-        vars(module).update(launch=timed)
-    for _ in range(repeats):
-        case.run()
-        spent.append(0.0)
-    for module in MODULES:
-        vars(module).update(launch=launch)
-    return statistics.median(spent[:-1]) * 1e6
-
-
 def python_calls(case: Case) -> int:
     """How many Python functions a forward pass calls, which takes no clock to compare."""
     called: list[str] = []
@@ -111,16 +87,6 @@ def python_calls(case: Case) -> int:
     case.run(backward=False)
     sys.setprofile(None)
     return len(called)
-
-
-def host_time(case: Case, repeats: int) -> list[float]:
-    """Microseconds of the host's thread in a forward pass: the least, the quartiles."""
-    times = []
-    for _ in range(repeats):
-        start = time.thread_time()
-        case.run(backward=False)
-        times.append(1e6 * (time.thread_time() - start))
-    return [min(times), *statistics.quantiles(times, n=4)]
 
 
 def measure(device: FakeDevice, given: dict) -> dict:
@@ -134,9 +100,6 @@ def measure(device: FakeDevice, given: dict) -> dict:
     answer["after_wait"] = list(case.dispatches.after_wait)
     answer["calls"], answer["forward"] = list(case.dispatches.all), [binary.name for binary in device.launches]
     answer["python"] = python_calls(case)
-    if given["repeats"]:
-        answer["microseconds"] = launch_time(case, given["repeats"])
-        answer["forward_microseconds"] = host_time(case, given["repeats"])
     return answer
 
 

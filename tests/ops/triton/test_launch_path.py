@@ -10,6 +10,7 @@ from triton.compiler import CompiledKernel
 from triton.runtime.jit import KernelInterface
 
 from sparsestreet.ops.triton import launch
+from tests.ops.triton.launch_alike import KINDS
 from tests.ops.triton.recording import run_compiler
 
 FORWARD = [
@@ -20,7 +21,7 @@ BACKWARD = ["decompose_pixels", "blend_tiles_backward", "sum_slots", "project_ro
 CALLS, LAUNCHES, PYTHON = 25, 8, 230
 """Most calls of torch in a forward pass with a background, allocations and views too, most launches, and most calls of
 Python's functions."""
-CASE = {"terms": 1, "pairs": 100_003, "background": True, "repeats": 0}
+CASE = {"terms": 1, "pairs": 100_003, "background": True}
 DAILY = CASE | {"width": 1920, "height": 1280}
 SLOW = [
     CASE | {"width": 1600, "height": 900, "terms": 16},
@@ -45,7 +46,9 @@ def check(case: dict, found: dict) -> None:
     assert {kernel["name"] for kernel in found["compiled"]} <= set(names)
     for kernel in found["compiled"]:
         sizes = expected(kernel["name"], case["width"], case["height"])
-        assert kernel["spilled"] == kernel["tensor_core"] == kernel["atomics"] == 0, kernel
+        # As in test_machine_code.py: the forward blend spills outside of its loop.
+        assert kernel["spilled"] <= 8 * (kernel["name"] == "blend_tiles"), kernel
+        assert kernel["tensor_core"] == kernel["atomics"] == 0, kernel
         assert kernel["shared"] <= 48 << 10, kernel
         # One number for each row, which fits 32 bits.
         assert kernel["types"].get("places", "*i32") == "*i32"
@@ -76,17 +79,11 @@ def test_every_kernel_compiles_for_other_sizes():
         assert len(found["dispatches"]) <= 6
 
 
-KINDS = [
-    "plain", "another plain", "unaligned target", "unaligned source", "doubles", "one", "sixteens", "zero", "long",
-    "least int", "long sixteens", "float", "count of one", "other constant", "other block", "other options",
-]  # fmt: skip
-
-
 @pytest.fixture(scope="module")
 def launched() -> dict[str, list[dict]]:
     """By version of Triton: what each launch got."""
     # An unknown one first: what a known one has bound is not bound again.
-    return run_compiler("launch_alike", {"3.12.0": ["plain", "plain"], "": KINDS * 3})
+    return run_compiler("launch_alike", {"3.12.0": ["plain", "plain"], "": [*KINDS] * 3})
 
 
 @pytest.fixture(scope="module")
