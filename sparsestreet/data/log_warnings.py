@@ -5,7 +5,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.data.hood import used_share
@@ -14,7 +14,7 @@ from sparsestreet.data.log import DrivingLog, counted
 from sparsestreet.data.photo_consistency import FEWEST, gray_changes
 from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.cameras import inverse, project, transform_points
-from sparsestreet.types import Camera, Frame, SparsePoints, Track, View
+from sparsestreet.types import Frame, SparsePoints, Track, View
 
 _MIDDLE = 0.25
 """Of width and height, the least distance of a principal point from a border: 0.27 and 0.28 of the height in Waymo's
@@ -377,7 +377,7 @@ def _unseen(points: SparsePoints, frames: Frames, cameras: Sequence[tuple[str, F
         return
     seen = torch.zeros(len(positions), dtype=torch.bool)
     for name, own in cameras:
-        found = [_in_image(own.views[at].camera, positions) for at in spread(len(own), _MAX_VIEWS)]
+        found = [project(own.views[at].camera, positions)[2] for at in spread(len(own), _MAX_VIEWS)]
         seen |= torch.stack(found).any(0)
         blind = sum(not some.any() for some in found)
         if 2 * blind > len(found):
@@ -392,10 +392,6 @@ _CHECK_POSES = (
     "check that poses and points are of one world and unit, that quaternions have w first (COLMAP: world to camera), "
     "and the axes of the cameras"
 )
-
-
-def _in_image(camera: Camera, positions: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-    return project(camera, positions)[2]
 
 
 def _other_colors(positions: Float[Tensor, "n 3"], gray: Float[Tensor, " n"], frames: Frames) -> Iterator[str]:

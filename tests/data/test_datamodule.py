@@ -32,16 +32,10 @@ def test_an_epoch_is_every_training_frame_once_in_a_new_order():
     first, second = keys(loader), keys(loader)
     assert len(loader) == len(first) == 18
     assert sorted(first) == sorted(second) == keys(data.split.train)
-    assert first != second != keys(data.split.train)
+    assert len({tuple(keys(data.split.train)), *map(tuple, (first, second, keys(loader), keys(loader)))}) == 5
 
 
-def test_no_two_epochs_have_the_same_order():
-    loader = StreetData(make_log(), seed=1).train_dataloader()
-    epochs = [tuple(keys(loader)) for _ in range(5)]
-    assert len(set(epochs)) == 5
-
-
-@pytest.mark.parametrize(("size", "accumulated"), [(1, 3), (2, 1), (3, 1), (2, 2)])
+@pytest.mark.parametrize(("size", "accumulated"), [(1, 3), (3, 1), (2, 2)])
 def test_processes_take_turns_in_the_order_of_one(size, accumulated):
     """Seven frames, which no number divides: no step ends with an epoch, and none has a frame of its own order."""
     frames = as_frames([frame_at(index) for index in range(7)])
@@ -72,22 +66,17 @@ def test_a_step_that_accumulates_finishes_all_of_its_images():
     assert len(data.train_dataloader()) == 3 * 18
 
 
-def test_the_order_is_given_by_the_seed():
+def test_the_order_is_given_by_the_seed_and_the_global_generator_stays():
     log = make_log()
+    torch.manual_seed(5)
+    before = torch.get_rng_state()
     orders = [keys(StreetData(log, seed=seed).train_dataloader()) for seed in (0, 0, 1)]
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(6)
     assert orders[0] == orders[1] != orders[2]
     second_of_zero = StreetData(log, seed=0).train_dataloader()
     list(second_of_zero)
     assert keys(second_of_zero) != orders[2]  # the second epoch of one seed is not the first of the next
-
-
-def test_the_global_generator_is_neither_read_nor_moved():
-    torch.manual_seed(0)
-    expected = torch.rand(3)
-    torch.manual_seed(0)
-    order = keys(StreetData(make_log()).train_dataloader())
-    assert torch.equal(torch.rand(3), expected)
-    assert order == keys(StreetData(make_log()).train_dataloader())
 
 
 def test_held_out_frames_come_in_order_every_time():
@@ -96,7 +85,7 @@ def test_held_out_frames_come_in_order_every_time():
     assert len(loader) == 6
 
 
-@pytest.mark.parametrize("limit", [1, 2, 5, 11, 12, 59, 60, 61])
+@pytest.mark.parametrize("limit", [1, 2, 12, 59, 61])
 def test_validation_looks_at_frames_from_the_whole_drive(limit):
     """60 held-out images of 20 instants: the gaps differ by one at most, and from two on both ends are among them."""
     data = StreetData(make_log(200, 3), stride=10, offset=5, val_frames=limit)
@@ -118,18 +107,15 @@ def test_validation_meets_every_camera(num_cameras):
     assert {camera for _, camera in keys(data.val_dataloader())} == set(range(num_cameras))
 
 
-def test_validation_needs_an_image():
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        StreetData(make_log(), val_frames=0)
-
-
-def test_choosing_what_to_validate_decodes_nothing():
+def test_choosing_what_to_validate_decodes_nothing_and_needs_an_image():
     def load(view: View) -> Frame:
         raise AssertionError("decoded")
 
     log = make_log(40)
     data = StreetData(dataclasses.replace(log, frames=Frames(log.views, load)), val_frames=2)
     assert len(data.val_dataloader()) == 2
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        StreetData(log, val_frames=0)
 
 
 @pytest.mark.parametrize("steps", [0, 5, 18, 20, 40])
@@ -156,16 +142,10 @@ def test_a_frame_moves_with_its_tensors_but_the_camera_stays():
     assert moved.camera is frame.camera
     assert (moved.depth, moved.frame_index, moved.time, moved.camera.width) == (None, 0, 0.0, 5)
     assert frame.image.device == torch.device("cpu")
-
-
-def test_moving_keeps_values_and_types():
-    frame = make_log(1).frames[0]
     copy = to_device(frame, torch.device("cpu"))
-    for field in dataclasses.fields(frame):
-        value = getattr(frame, field.name)
-        same = torch.equal(getattr(copy, field.name), value) if torch.is_tensor(value) else True
-        assert same
-    assert copy.image.dtype == torch.uint8
+    assert torch.equal(copy.image, frame.image)
+    assert torch.equal(copy.sky, frame.sky)
+    assert (copy.image.dtype, copy.sky.dtype) == (torch.uint8, torch.bool)
 
 
 class Recorder(lightning.LightningModule):
@@ -241,7 +221,7 @@ def small_street() -> StreetData:
 
 # Lightning 2.6 asks torch about tree leaves in a way that torch 2.13 has deprecated.
 @pytest.mark.filterwarnings("ignore:.*LeafSpec.*:FutureWarning")
-@pytest.mark.parametrize("steps", [4, 5, 7])
+@pytest.mark.parametrize("steps", [5, 7])
 def test_lightning_resumes_with_the_frames_that_were_left(steps, tmp_path):
     """Epochs have 5 frames, so that 7 steps end within one and 5 at its end."""
     whole, _ = fit(small_street(), 12)

@@ -8,12 +8,9 @@ from typing import NoReturn
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.frame_cache import Prefetcher
-from sparsestreet.data.images import read_image
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_warnings import log_warnings
 from sparsestreet.data.problems import LogError, fault
@@ -22,9 +19,8 @@ from sparsestreet.data.rig import RigCamera, lens_camera, rig_camera
 from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.lenses import Fisheye, Lens, Rational
 from sparsestreet.geometry.trajectories import Trajectories
-from sparsestreet.types import Frame, Shutter
+from sparsestreet.types import Shutter
 from tests.data.plan import PER_SECOND, Plan, moved, pose, turned
-from tests.scene.street import frame_at
 from tests.typed import there
 
 SIZE = (24, 16)
@@ -38,24 +34,29 @@ def camera(lens: Lens) -> RigCamera[str]:
     return lens_camera("front", 0, lens=lens, recorded_size=SIZE, pinhole_fov=None if lens is FLAT else 150.0)
 
 
+ORIGIN = torch.eye(4, dtype=torch.float64)
+FAR = torch.eye(4, dtype=torch.float64)
+FAR[:3, 3] = torch.tensor([4e6, -2e6, 100.0])
+
+
+def log_with(*stamps: int | None, lens: Lens = FLAT, at: torch.Tensor = ORIGIN, **parts) -> DrivingLog:
+    """Black images of one camera at a place, each with its stamp, and parts of a recording."""
+    shots = [RecordedImage(frame, 0, at, None, "", stamp) for frame, stamp in enumerate(stamps or [None])]
+    black = torch.zeros(SIZE[1], SIZE[0], 3, dtype=torch.uint8)
+    found = Recording("a", [camera(lens)], shots, lambda shot: black, lambda shot: {})
+    return log_of(replace(found, **parts), cache_bytes=0, check=list)
+
+
 @pytest.mark.parametrize("user", [{}, {"ego": HOOD}], ids=["no mask", "a hood"])
 @pytest.mark.parametrize("lens", [WIDE, FLAT], ids=["fisheye", "pinhole"])
 def test_no_loss_sees_what_the_lens_did_not_record(lens, user):
-    mounted = camera(lens)
-    recording = Recording(
-        name="a",
-        rig=[mounted],
-        shots=[RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
-        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
-        read_masks=lambda shot: user,
-    )
-    log = log_of(recording, cache_bytes=0, check=list)
+    log = log_with(lens=lens, read_masks=lambda shot: user)
     ego = log.frames[0].ego
     if lens is FLAT:
         assert ego is user.get("ego")
         assert "resampled" not in " ".join(log.notes)
     else:
-        blank = there(there(mounted.undistortion).blank)
+        blank = there(there(camera(lens).undistortion).blank)
         assert 0 < int(blank.sum()) < blank.numel()
         assert torch.equal(there(ego), blank | HOOD if user else blank)
         assert any("resampled to a pinhole of 150 degrees" in note for note in log.notes)
@@ -63,18 +64,9 @@ def test_no_loss_sees_what_the_lens_did_not_record(lens, user):
 
 
 def test_points_that_came_with_the_log_are_in_its_world_and_give_no_depth():
-    pose, reads = torch.eye(4, dtype=torch.float64), []
-    pose[:3, 3] = torch.tensor([4e6, -2e6, 100.0])
-    ahead = pose[:3, 3] + torch.tensor([[0.0, 0.25, 5.0]], dtype=torch.float64)
-    recording = Recording(
-        name="a",
-        rig=[camera(FLAT)],
-        shots=[RecordedImage(0, 0, pose, key=None, stem="0")],
-        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
-        read_masks=lambda shot: {},
-        sparse_points=lambda: reads.append(1) or (ahead, torch.tensor([[0.25, 0.5, 0.75]])),
-    )
-    log = log_of(recording, cache_bytes=0, check=list)
+    ahead, reads = FAR[:3, 3] + torch.tensor([[0.0, 0.25, 5.0]], dtype=torch.float64), []
+    colors = torch.tensor([[0.25, 0.5, 0.75]])
+    log = log_with(at=FAR, sparse_points=lambda: reads.append(1) or (ahead, colors))
     assert not reads  # nothing is decoded when a log is opened
     sparse = there(log.sparse_points)
     assert sparse().positions.tolist() == [[0.0, 0.25, 5.0]]
@@ -89,16 +81,7 @@ def test_points_that_are_not_finite_are_left_out_and_gray_ones_are_told(broken):
     """-1e39 m is finite in the file, and not in float32."""
     places = torch.tensor([[0.0, 1.0, 5.0]] * 5, dtype=torch.float64)
     places[3, 1], places[4, 2] = broken, math.nan
-    recording = Recording(
-        name="a",
-        rig=[camera(FLAT)],
-        shots=[RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
-        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
-        read_masks=lambda shot: {},
-        sparse_points=lambda: (places, torch.full((5, 3), 0.5)),
-        points_file=Path("cloud.ply"),
-    )
-    log = log_of(recording, cache_bytes=0, check=list)
+    log = log_with(sparse_points=lambda: (places, torch.full((5, 3), 0.5)), points_file=Path("cloud.ply"))
     assert there(log.sparse_points)().positions.tolist() == [[0.0, 1.0, 5.0]] * 3
     lost, gray = log_warnings(replace(log, frames=log.frames[:0]))
     assert lost == "2 of 5 points of cloud.ply are not finite, the first is point 3: left out"
@@ -106,32 +89,14 @@ def test_points_that_are_not_finite_are_left_out_and_gray_ones_are_told(broken):
 
 
 def test_points_far_from_the_origin_keep_their_millimeters():
-    pose = torch.eye(4, dtype=torch.float64)
-    pose[:3, 3] = torch.tensor([4e6, -2e6, 100.0])
     ahead = torch.tensor([[0.123, 0.456, 5.789]], dtype=torch.float64)
-    recording = Recording(
-        name="a",
-        rig=[camera(FLAT)],
-        shots=[RecordedImage(0, 0, pose, key=None, stem="0")],
-        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
-        read_masks=lambda shot: {},
-        sweeps={0: LidarSweep(lambda: pose[:3, 3] + ahead)},
-    )
-    points = log_of(recording, cache_bytes=0, check=list).sweeps[0].points
+    points = log_with(at=FAR, sweeps={0: LidarSweep(lambda: FAR[:3, 3] + ahead)}).sweeps[0].points
     torch.testing.assert_close(points.double(), ahead, rtol=0, atol=1e-6)  # float32 of 6 m
 
 
 def test_the_recording_car_has_no_returns():
     points = torch.tensor([[0.0, 0.5, 5.0], [0.0, 1.3, 5.0]], dtype=torch.float64)  # rows 11 and 15.8
-    recording = Recording(
-        name="a",
-        rig=[camera(FLAT)],
-        shots=[RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), key=None, stem="0")],
-        read_image=lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8),
-        read_masks=lambda shot: {"ego": HOOD},
-        sweeps={0: LidarSweep(lambda: points)},
-    )
-    log = log_of(recording, cache_bytes=0, check=list)
+    log = log_with(read_masks=lambda shot: {"ego": HOOD}, sweeps={0: LidarSweep(lambda: points)})
     assert there(log.frames[0].depth).nonzero().tolist() == [[11, 12]]
     assert log.sweeps[0].colored.tolist() == [True, False]
 
@@ -139,13 +104,10 @@ def test_the_recording_car_has_no_returns():
 def test_a_declared_shutter_arrives_at_the_view():
     rolling = Shutter(torch.tensor([0.0, 0.0, 0.4]), torch.zeros(3), direction="left")
     shots = [
-        RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), key=None, stem="", shutter=shutter)
+        RecordedImage(frame, 0, ORIGIN, key=None, stem="", shutter=shutter)
         for frame, shutter in enumerate((rolling, None))
     ]
-    recording = Recording(
-        "a", [camera(FLAT)], shots, lambda shot: torch.zeros(16, 24, 3, dtype=torch.uint8), lambda shot: {}
-    )
-    log = log_of(recording, cache_bytes=0, check=list)
+    log = log_with(shots=shots)
     assert [view.camera.shutter for view in log.views] == [rolling, None]
 
 
@@ -161,13 +123,8 @@ def test_boxes_of_one_object_that_differ_in_size_are_told():
     """One grows in length; the other is measured to a few centimeters."""
     grown, measured = moving([0, 1, 2], [100, 110, 125]), replace(moving([0, 2], [100, 125]), name="van")
     grown.sizes[2, 0], measured.sizes[1, 2] = 3.0, 1.09
-    shots = [RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), None, "", 100 + frame) for frame in range(3)]
-    black = torch.zeros(16, 24, 3, dtype=torch.uint8)
-    recording = Recording(
-        "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=(100, 101, 102),
-        boxes=[grown, measured],
-    )  # fmt: skip
-    said = [note for note in log_of(recording, cache_bytes=0, check=list).notes if "differ" in note]
+    log = log_with(100, 101, 102, frame_stamps=(100, 101, 102), boxes=[grown, measured])
+    said = [note for note in log.notes if "differ" in note]
     assert said == ["the boxes of some objects differ in size, their mean is taken: car, length 1.00 to 3.00 m"]
 
 
@@ -185,19 +142,11 @@ def test_boxes_of_one_object_that_differ_in_size_are_told():
 def test_an_object_is_on_its_way_between_annotated_instants(
     frames: list[int], annotated: set[int] | None, there: list[int]
 ):
-    stamps = [100, 110, 125, 130, 140]  # images do not come evenly
+    stamps = (100, 110, 125, 130, 140)  # images do not come evenly
     own = {-2: 80, 0: 100, 2: 121, 4: 141, 6: 160}  # nor are boxes where images are
-    shots = [
-        RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), None, "", stamp)
-        for frame, stamp in enumerate(stamps)
-    ]
     boxes = moving(frames, [own[frame] for frame in frames])
-    black = torch.zeros(16, 24, 3, dtype=torch.uint8)
-    recording = Recording(
-        "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=tuple(stamps), boxes=[boxes],
-        annotated=None if annotated is None else frozenset(annotated),
-    )  # fmt: skip
-    (track,) = log_of(recording, cache_bytes=0, check=list).tracks
+    instants = None if annotated is None else frozenset(annotated)
+    (track,) = log_with(*stamps, frame_stamps=stamps, boxes=[boxes], annotated=instants).tracks
     assert track.frames.tolist() == there
     at = [own[frame] if frame in frames else stamps[frame] for frame in there]
     assert track.world_from_object[:, 0, 3].tolist() == pytest.approx([stamp / 10 for stamp in at], abs=1e-9)
@@ -209,16 +158,7 @@ def test_a_box_between_two_has_the_size_of_the_one_before():
     """The two boxes between the three that are annotated; the size of the object is the mean of all."""
     boxes, stamps = moving([0, 2, 4], [100, 121, 141]), (100, 110, 121, 130, 141)
     boxes.sizes[:, 0] = 1.0, 1.05, 1.09
-    shots = [
-        RecordedImage(frame, 0, torch.eye(4, dtype=torch.float64), None, "", stamp)
-        for frame, stamp in enumerate(stamps)
-    ]
-    black = torch.zeros(16, 24, 3, dtype=torch.uint8)
-    recording = Recording(
-        "a", [camera(FLAT)], shots, lambda shot: black, lambda shot: {}, frame_stamps=stamps, boxes=[boxes],
-        annotated=frozenset({0, 2, 4}),
-    )  # fmt: skip
-    (track,) = log_of(recording, cache_bytes=0, check=list).tracks
+    (track,) = log_with(*stamps, frame_stamps=stamps, boxes=[boxes], annotated=frozenset({0, 2, 4})).tracks
     assert track.size.tolist() == pytest.approx([(1.0 + 1.0 + 1.05 + 1.05 + 1.09) / 5, 1.0, 1.0], abs=1e-6)
 
 
@@ -443,24 +383,3 @@ def test_without_a_clock_all_of_a_frame_has_the_frames_time():
     assert [view.time for view in log.views] == [frame / 3 for frame in range(4) for _ in range(2)]
     assert [one.time for one in log.sweeps] == [0.0, 1 / 3, 2 / 3, 1.0]
     assert (log.tracks[0].times, log.tracks[0].span, log.frame_periods) == (None, None, 3.0)
-
-
-def test_a_frame_that_vanished_is_an_error_at_its_own_step_and_the_others_are_read(tmp_path: Path):
-    """The threads meet it early; who trains hears of it when the frame is due, and may go on behind it."""
-    paths = [tmp_path / f"{number}.png" for number in range(6)]
-    for path in paths:
-        Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(path)
-    paths[3].unlink()
-
-    def read(draw: int) -> Frame:
-        read_image(paths[draw], (6, 4))
-        return frame_at(draw)
-
-    ahead = Prefetcher(read, torch.device("cpu"), threads=2)
-    try:
-        assert [ahead.take(draw).frame_index for draw in range(3)] == [0, 1, 2]
-        with pytest.raises(LogError, match=r"3\.png.*cannot be decoded .*No such file"):
-            ahead.take(3, 6)
-        assert [ahead.take(draw, 6).frame_index for draw in (4, 5)] == [4, 5]
-    finally:
-        ahead.close()

@@ -419,7 +419,7 @@ class Argoverse2Reader(RecordedReader):
             frame_stamps=chosen.instants,
             sweeps=_sweeps(chosen, path) if self.lidar else None,
             boxes=boxes,
-            vehicle=_driven(chosen, path),
+            vehicle=PosePath(torch.tensor(chosen.instants), path.at(torch.tensor(chosen.instants))),
             notes=(
                 *_notes(chosen, duplicates, homeless, len(shots)),
                 *empty_notes(read_points, [chosen.sweeps[stamp] for stamp in chosen.instants] if self.lidar else []),
@@ -458,12 +458,6 @@ def _check_covered(chosen: Selection, path: PosePath) -> None:
             message = f"poses from {int(path.stamps[0])} to {int(path.stamps[-1])} do not cover what is of {stamp}"
             remedy = "read only frames with poses (data.log.first_frame, .last_frame)"
             raise fault(chosen.layout.poses, message, remedy)
-
-
-def _driven(chosen: Selection, path: PosePath) -> PosePath:
-    """The vehicle at the stamps of the frames."""
-    stamps = torch.tensor(chosen.instants)
-    return PosePath(stamps, path.at(stamps))
 
 
 def _shots(chosen: Selection, mounts: Mapping[str, MountedCamera], path: PosePath) -> list[RecordedImage]:

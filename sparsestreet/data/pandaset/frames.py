@@ -3,7 +3,7 @@
 import gzip
 import io
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,19 @@ def _content(path: Path) -> bytes:
     return content
 
 
+def _check_places(places: Sequence[Any], num_columns: int) -> None:
+    """Raise ValueError unless the blocks of a table, each at a slice or an array of places, hold each column once.
+
+    pandas writes to these places without a look at its bounds: a wrong one overwrites memory.
+    """
+    found = [range(one.start, one.stop, one.step or 1) if isinstance(one, slice) else one for one in places]
+    known = all(isinstance(one, range) or (isinstance(one, np.ndarray) and one.dtype.kind in "iu") for one in found)
+    # Their number first: a range may be endless.
+    fits = known and sum(map(len, found)) == num_columns
+    if not fits or sorted(int(place) for one in found for place in one) != list(range(num_columns)):
+        raise ValueError("its blocks do not say which columns they hold")
+
+
 @cache
 def _names() -> dict[str, Any]:
     """Return what a table of pandas 0.25 (which wrote the data set) to 3 may name."""
@@ -56,12 +69,15 @@ def _names() -> dict[str, Any]:
 
     class Manager(BlockManager):
         def __new__(cls, *arguments: Any) -> "Manager":
+            if arguments:
+                _check_places([block.mgr_locs.indexer for block in arguments[0]], len(arguments[1][0]))
             return super().__new__(cls, *(arguments or ((), [], False)))
 
         def __setstate__(self, state: Any) -> None:
             inner = state[3]["0.14.1"]
             check(inner["axes"], pandas.Index)
             check([block["values"] for block in inner["blocks"]], np.ndarray)
+            _check_places([block["mgr_locs"] for block in inner["blocks"]], len(inner["axes"][0]))
             super().__setstate__(state)  # pyright: ignore[reportAttributeAccessIssue]
 
     def check(parts: Any, kind: type) -> None:

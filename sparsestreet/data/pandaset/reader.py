@@ -1,6 +1,6 @@
 """From the files of a sequence to a recording."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -127,7 +127,7 @@ def read_objects(
     problems: list[Problem] = []
     twins = crowded = 0
     for index, frame in enumerate(frames):
-        cuboids = attempt(problems, _reading(layout, frame))
+        cuboids = attempt(problems, partial(read_cuboids, layout.boxes(frame)))
         if cuboids is None:
             continue
         twins += cuboids.twins
@@ -143,12 +143,19 @@ def read_objects(
             one.sizes.append(cuboids.sizes[row])
     if problems:
         raise LogError(problems)
-    boxes = [_boxes(layout, name, one) for name, one in objects.items()]
+    boxes = [
+        Boxes(
+            name=name,
+            class_name=one.label,
+            frames=np.array(one.frames),
+            poses=np.stack(one.poses),
+            sizes=np.stack(one.sizes),
+            path=layout.cuboids,
+            stamps=tuple(one.stamps),
+        )
+        for name, one in objects.items()
+    ]
     return Objects(boxes, sum(one.stationary for one in objects.values()), twins, crowded)
-
-
-def _reading(layout: Layout, frame: int) -> Callable[[], Cuboids]:
-    return lambda: read_cuboids(layout.boxes(frame))
 
 
 def _delays(cuboids: Cuboids, world_from_lidar: Float64[Tensor, "4 4"], spin: Spin | None) -> np.ndarray:
@@ -158,18 +165,6 @@ def _delays(cuboids: Cuboids, world_from_lidar: Float64[Tensor, "4 4"], spin: Sp
     centers = transform_points(inverse(world_from_lidar), torch.from_numpy(cuboids.poses[:, :3, 3])).numpy()
     seconds = spin.passing(np.arctan2(centers[:, 1], centers[:, 0]))
     return np.where(cuboids.spinning, np.round(seconds * PER_SECOND), 0).astype(np.int64)
-
-
-def _boxes(layout: Layout, name: str, one: _Object) -> Boxes:
-    return Boxes(
-        name=name,
-        class_name=one.label,
-        frames=np.array(one.frames),
-        poses=np.stack(one.poses),
-        sizes=np.stack(one.sizes),
-        path=layout.cuboids,
-        stamps=tuple(one.stamps),
-    )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -237,7 +237,6 @@ DAMAGE = {
     "no frames": (top_with(frames=None), "has no 'frames'"),
     "frames of none": (top_with(frames=[]), "frames is empty"),
     "frames no list": (top_with(frames={"a": 1}), "frames is an object of 1, not a list"),
-    "a frame no object": (lambda content: content["frames"].append(7), r"frames\[8\] is 7, not an object"),
     "no file": (without("file_path"), r"frames\[3\] has no 'file_path'"),
     "file no text": (frame_with(file_path=3), r"frames\[3\]\.file_path is 3, not a text"),
     "file outside": (frame_with(file_path="../a.png"), "no file below the folder of transforms.json"),
@@ -247,29 +246,23 @@ DAMAGE = {
     "file twice": (lambda content: content["frames"].append(content["frames"][0]), "are of one camera and one instant"),
     "no pose": (without("transform_matrix"), r"frames\[3\] has no 'transform_matrix'"),
     "pose of 2 rows": (frame_with(transform_matrix=EYE[:2]), r"transform_matrix has 2 rows, not 4"),
-    "pose of 3 columns": (frame_with(transform_matrix=np.eye(3).tolist()), r"has 3 numbers, not 4"),
     "pose of words": (frame_with(transform_matrix=[["a"] * 4] * 4), r"transform_matrix\[0\]\[0\] is 'a', not a number"),
     "pose not finite": (frame_with(transform_matrix=[[math.nan] * 4] * 4), "must be finite, it is nan"),
     "pose scaled": (frame_with(transform_matrix=(2 * np.eye(4)).tolist()), "the pose of .* is no rigid transform"),
-    "pose mirrored": (frame_with(transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), "is no rigid transform"),
     "pose far away": (frame_with(transform_matrix=[*EYE[:2], [0, 0, 1, 9e7], EYE[3]]), "poses span"),
     "no focal length": (without("fl_x"), r"frames\[3\] has no 'fl_x', nor has the top of the file"),
     "focal length 0": (frame_with(fl_x=0), r"frames\[3\]\.fl_x must be positive, it is 0"),
-    "focal length true": (frame_with(fl_x=True), "fl_x is True, not a number"),
     "focal length huge": (frame_with(fl_x=10**400), "fl_x must be positive, it is a number of too many digits"),
     "angle too wide": (lambda content: (without("fl_x")(content), top_with(camera_angle_x=4.0)(content)), "4 radians"),
     "width half": (frame_with(w=31.5), "w must be a whole number from 1 to 100000, it is 31.5"),
-    "width 0": (frame_with(w=0), "w must be a whole number from 1"),
     "another size": (frame_with(w=64), "the image is 32x24, camera .* is calibrated for 64x24"),
     "a lens unknown": (frame_with(camera_model="EQUIRECTANGULAR"), "'EQUIRECTANGULAR', a lens that is not read"),
-    "a lens folds": (frame_with(p1=1.0, p2=1.0), "no inverse"),
     "a fisheye folds": (frame_with(camera_model="OPENCV_FISHEYE", k1=-3.0), "folds back"),
     "k4 of a pinhole": (frame_with(k4=0.1), "this model has no k4"),
     "a time not finite": (frame_with(time=math.nan), r"frames\[3\]\.time is nan, no time"),
     "some times": (frame_with(time=0.5), "has a time in 1 of 8 frames"),
     "no mask": (frame_with(mask_path="none.png"), "none.png: the file is missing"),
     "no points": (top_with(ply_file_path="none.ply"), "none.ply: the file is missing"),
-    "points outside": (top_with(ply_file_path="../none.ply"), "no file below the folder"),
 }
 
 
@@ -324,8 +317,8 @@ def test_broken_pixels_and_points_are_found_by_the_check(written):
     reader = NerfstudioReader(root=folder)
     log = reader.read()  # nothing large is decoded
     assert [problem.path.name for problem in reader.check()] == ["frame_9.png", "sparse_pc.ply"]
-    with pytest.raises(LogError, match=r"frame_9\.png: the image cannot be decoded"):
-        log.frames[2]
+    with pytest.raises(LogError, match=r"2 problems in the log:\n.*frame_9\.png: the image cannot be decoded"):
+        log.frames[2]  # explained by all that a check finds
     with pytest.raises(LogError, match=r"sparse_pc\.ply: the header does not describe points"):
         there(log.sparse_points)()
 

@@ -9,6 +9,7 @@ import shutil
 import time
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,12 +79,6 @@ def truncated_block(path: Path) -> None:
     write(path, made)
 
 
-def places_beyond(path: Path) -> None:
-    made = table(sweep(PLAN, 1))
-    made.state["_data"].state[3]["0.14.1"]["blocks"][0]["mgr_locs"] = np.array([0, 1, 2, 3, 99])
-    write(path, made)
-
-
 DAMAGES: dict[str, tuple[str, Damage, str]] = {
     "no stamps": (STAMPS, gone, "missing"),
     "no image": (IMAGE, gone, "missing"),
@@ -107,7 +102,6 @@ DAMAGES: dict[str, tuple[str, Damage, str]] = {
     "text for numbers": (BOXES, anew(yaw=["a", "b", "c"]), "column yaw holds a str"),
     "numbers for flags": (BOXES, anew(stationary=np.zeros(3)), "column stationary holds float64"),
     "a block of one column": (SWEEP, truncated_block, "IndexError"),
-    "places beyond": (SWEEP, places_beyond, "Gaps in blk ref_locs"),
     "a point of NaN": (SWEEP, cell("x", np.nan), "1 of"),
     "a box twice": (BOXES, anew(uuid=["a", "a", "b"], **{"cuboids.sibling_id": [""] * 3}), "has two boxes"),
 }
@@ -120,6 +114,21 @@ def test_a_damage_is_one_error_that_names_the_file(name, sequence):
     file, damage, said = DAMAGES[name]
     damage(sequence / file)
     assert_found(PandaSetReader(root=sequence), sequence / file, said)
+
+
+@pytest.mark.parametrize("place", [10**9, -(10**9), 3])
+@pytest.mark.parametrize("era", ["old", "new"])
+def test_a_table_whose_blocks_are_elsewhere_is_refused_before_pandas_writes_there(era, place, tmp_path):
+    made, places = table(sweep(PLAN, 1), era), np.array([0, 1, 2, 3, place])
+    if era == "old":
+        made.state["_data"].state[3]["0.14.1"]["blocks"][0]["mgr_locs"] = places
+    else:
+        blocks, axes = made.state["_mgr"].arguments
+        moved = replace(blocks[0], arguments=(blocks[0].arguments[0], places, 2))
+        made.state["_mgr"] = replace(made.state["_mgr"], arguments=((moved, *blocks[1:]), axes))
+    write(tmp_path / "01.pkl", made)
+    with pytest.raises(LogError, match="its blocks do not say which columns they hold"):
+        read_columns(tmp_path / "01.pkl", {"x": float})
 
 
 HARM = {
