@@ -55,7 +55,13 @@ def test_steps_are_those_of_the_decimal_fraction(steps):
 
 
 def test_impossible_moments_are_refused():
-    for start, stop, every, shift in ((0.6, 0.5, 1, 0), (-0.1, 0.5, 1, 0), (0, 1.1, 1, 0), (0, 1, 0, 0), (0, 1, 3, 3)):
+    for start, stop, every, shift in (
+        (0.6, 0.5, 1, 0),
+        (-0.1, 0.5, 1, 0),
+        (0.0, 1.1, 1, 0),
+        (0.0, 1.0, 0, 0),
+        (0.0, 1.0, 3, 3),
+    ):
         with pytest.raises(ValueError, match="interval needs"):
             Interval(start, stop, every, shift)
     for fraction in (1.5, -0.1):
