@@ -11,10 +11,12 @@ import torch
 from PIL import Image
 
 from sparsestreet.data.synthetic import StreetReader
+from sparsestreet.data.synthetic import street as street_files
 from sparsestreet.data.synthetic.capture import street_camera
 from sparsestreet.data.synthetic.models import Clothes, Pedestrian
+from sparsestreet.data.synthetic.render import StreetFrame, StreetImage, StreetSweep
 from sparsestreet.data.synthetic.settings import WAYMO_TOP, StreetSettings
-from sparsestreet.data.synthetic.street import joint_rotations, make_street, noisy_box, noisy_camera
+from sparsestreet.data.synthetic.street import StreetWriter, joint_rotations, make_street, noisy_box, noisy_camera
 from sparsestreet.data.synthetic.tracer import at
 from sparsestreet.data.synthetic.world import build_world
 from sparsestreet.geometry import quaternions as quat
@@ -273,6 +275,32 @@ def test_a_street_without_objects(tmp_path):
     assert json.loads((root / "instances/frame_instances.json").read_text()) == {"0": []}
     assert json.loads((root / "instances/instances_info.json").read_text()) == {}
     assert not np.array(Image.open(root / "dynamic_masks/all/000_0.png")).any()
+
+
+def test_a_box_needs_six_pixels_or_three_returns_and_a_body_six_pixels_of_one_camera(tmp_path, monkeypatch):
+    settings = StreetSettings(
+        num_frames=1, width=16, height=9, num_cameras=2, num_parked_cars=0, num_moving_cars=0, num_cyclists=0,
+        num_pedestrians=5, annotation_range=1000.0,
+    )  # fmt: skip
+    world = build_world(settings)
+    # Of five people: pixels in both cameras, and returns.
+    pixels, returns = np.array([[5, 3, 0, 0, 0], [0, 3, 6, 0, 0]]), [0, 0, 0, 3, 2]
+    ego, images = world.ego.pose(0.0), []
+    for camera, counts in enumerate(pixels):
+        seen = np.full((9, 16), -1, np.int16)
+        seen.flat[: counts.sum()] = np.repeat(np.arange(5), counts)
+        blank, sky = np.zeros((9, 16), np.float32), np.zeros((9, 16), bool)
+        rgb = np.zeros((9, 16, 3), np.uint8)
+        images.append(StreetImage(street_camera(settings, camera, ego), rgb, blank, seen, sky))
+    hit = np.repeat(np.arange(5), returns).astype(np.int16)
+    sweep = StreetSweep(np.zeros((5, 4), np.float32), hit, ego)
+    with_bodies = []
+    monkeypatch.setattr(street_files, "pickled_people", lambda people: with_bodies.extend(people) or b"")
+    writer = StreetWriter(tmp_path, settings, world)
+    writer.write_frame(StreetFrame(0, ego, tuple(images), sweep, tuple(actor.pose(0.0) for actor in world.actors)))
+    writer.finish()
+    assert [one["id"] for one in instances(tmp_path).values()] == ["pedestrian_01", "pedestrian_02", "pedestrian_03"]
+    assert [instances(tmp_path)[key]["id"] for key in with_bodies] == ["pedestrian_02"]
 
 
 NOISY = StreetSettings(
