@@ -74,6 +74,10 @@ def test_the_term_of_a_frame_is_a_mean_over_the_objects_that_have_it():
     # |0 + 0 - 2 x 1|, then |0 + 0 - 2 x 5|; the third object has no keyframe after its second. A camera that fires
     # 0.04 after the boxes sees these; one 0.06 after the last of an object sees none.
     assert at == pytest.approx([0, 2, 10, 10, 0])
+    # Where a keyframe is missing nobody is near, though the one before is the nearest.
+    gap, whole = torch.tensor([[0.0, 0.1, 0.3]]), torch.ones(1, 3, dtype=torch.bool)
+    near = [temporal_smoothness_at(gap, translations[:1], whole, time, 1).item() for time in (0.145, 0.16)]
+    assert near == pytest.approx([2, 0])
     translations.requires_grad_()
     temporal_smoothness_at(times, translations, valid, 0.1, 1).backward()
     assert translations.grad[0, :, 0].tolist() == pytest.approx([0, 2 / 3, 0])  # the neighbors stand still
