@@ -54,10 +54,13 @@ def test_steps_are_those_of_the_decimal_fraction(steps):
         assert not before.due(before.last(Course(steps)) + 1, Course(steps)), fraction
 
 
-def test_impossible_moments_are_refused():
-    for interval in ((0.6, 0.5, 1), (-0.1, 0.5, 1), (0.0, 1.1, 1), (0.0, 1.0, 0), (0.0, 1.0, 3, 3)):
-        with pytest.raises(ValueError, match="interval needs"):
-            Interval(*interval)
+@pytest.mark.parametrize(
+    ("start", "stop", "every", "shift"),
+    [(0.6, 0.5, 1, 0), (-0.1, 0.5, 1, 0), (0.0, 1.1, 1, 0), (0.0, 1.0, 0, 0), (0.0, 1.0, 3, 3)],
+)
+def test_impossible_moments_are_refused(start, stop, every, shift):
+    with pytest.raises(ValueError, match="interval needs"):
+        Interval(start, stop, every, shift)
     for fraction in (1.5, -0.1):
         with pytest.raises(ValueError, match="fraction"):
             milestone(fraction, Course(10))
