@@ -20,7 +20,6 @@ from sparsestreet.training.losses import MaskSparsity, Photometric
 from sparsestreet.training.run import fit
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
-from tests.scene.street import RATES
 from tests.training.stubs import Listener, background, make_rows, make_system, rigid, street_data
 
 IMAGES = 48
@@ -66,7 +65,7 @@ def system() -> StreetSystem:
                 density=density,
                 max_gaussians=60,
                 min_gaussians=10,
-                learning_rates=RATES | {"mask": LearningRate(0.01)},
+                learning_rates=dict.fromkeys(("rows", "mask"), LearningRate(0.01)),
             )
         ),
     }
