@@ -8,8 +8,9 @@ from pathlib import Path
 
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.cli.commands.bench import record_file
-from sparsestreet.cli.commands.effects import planned
 from sparsestreet.cli.commands.options import run_command
+from sparsestreet.cli.config.compose import composed
+from sparsestreet.cli.runs.run import opened
 from sparsestreet.records.run import EffectDecision
 
 LEVELS = (0.5, 2.0)
@@ -133,6 +134,12 @@ class RecallRequest:
 
     seeds: int = 10
     out: Path = Path("outputs/bench")
+
+
+def planned(overrides: Sequence[str]) -> tuple[EffectDecision, ...]:
+    """Return the plan of a training with these options."""
+    _, data, recipe = opened(composed(overrides))
+    return recipe.decisions(recipe.plan(data), data)
 
 
 def main(words: list[str]) -> int:

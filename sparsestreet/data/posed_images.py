@@ -30,7 +30,8 @@ from sparsestreet.data.problems import (
     missing_notes,
 )
 from sparsestreet.data.reader import LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recording import RecordedImage, RecordedReader, Recording, read_given, read_shot
+from sparsestreet.data.recorded_images import RecordedImage, read_given, read_shot
+from sparsestreet.data.recording import RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.geometry.lenses import Lens
 

@@ -5,7 +5,7 @@ depth images and colors of returns are the same for all data sets, and are done 
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
@@ -19,15 +19,12 @@ from jaxtyping import Bool, Float, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.frame_cache import CacheSize, FrameCache, MemoryForecast, cache_bytes
-from sparsestreet.data.hood import bottom_rows
 from sparsestreet.data.images import (
     MASK_KINDS,
     GivenMasks,
     check_camera_images,
     image_notes,
-    image_size,
     joined,
-    read_image,
     read_transparent,
 )
 from sparsestreet.data.lazy import Frames, Sweeps
@@ -36,11 +33,12 @@ from sparsestreet.data.log import DrivingLog, VehiclePath, absence_notes
 from sparsestreet.data.poses import PosePath, dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import LogReader
+from sparsestreet.data.recorded_images import RecordedImage
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.timestamps import LogClock
 from sparsestreet.data.tracks import checked_track, repeated, timed_tracks, track_in_window
 from sparsestreet.geometry.boxes import CarriedPoints, without_frames
-from sparsestreet.types import Frame, Shutter, SparsePoints, Sweep, Track, View
+from sparsestreet.types import Frame, SparsePoints, Sweep, Track, View
 
 T = TypeVar("T")
 
@@ -170,40 +168,6 @@ class SceneFolder:
 
 
 @dataclass(frozen=True)
-class RecordedImage:
-    """One recorded image."""
-
-    frame: int
-    """The instant it belongs to, counted from 0 in the window that is read. A camera has one image an instant."""
-    camera: int
-    """Place of its camera in the rig."""
-    world_from_camera: Float64[Tensor, "4 4"]
-    """OpenCV's axes; in the data set's own world, at the middle of the readout."""
-    key: Hashable
-    """What ``Recording.read_image`` needs to find the pixels: mostly a path."""
-    stem: str
-    """Its name without folder and ending; a user's own masks are found by it."""
-    stamp: int | None = None
-    """Nanoseconds on the data set's clock at the middle of exposure and readout; None: the data set has no clock."""
-    shutter: Shutter | None = None
-    """Its motion while it is read out, where the data set declares a rolling shutter."""
-    exposure: float | None = None
-    """Seconds that a pixel is exposed, where declared."""
-
-    @property
-    def path(self) -> Path | None:
-        """The file of its pixels; None: they stand in the file of many."""
-        found = getattr(self.key, "path", self.key)
-        return Path(found) if isinstance(found, (str, Path)) else None
-
-    @property
-    def file(self) -> Path:
-        """The same, of an image that is known to have a file of its own."""
-        assert self.path is not None
-        return self.path
-
-
-@dataclass(frozen=True)
 class LidarSweep:
     """The returns of one instant, of all lidars together."""
 
@@ -266,46 +230,6 @@ class Recording:
     """The car in the data set's own world, x ahead, y left, z up; None: the data set does not tell."""
     notes: tuple[str, ...] = ()
     """What a user should know about how it was read, one sentence each."""
-
-
-Masks = Mapping[str, Bool[Tensor, "h w"]]
-
-
-@dataclass(frozen=True)
-class Pixels:
-    """Decodes images whose files are the keys of their shots, and the masks of these."""
-
-    rig: Sequence[RigCamera[str]]
-    recorded_sizes: Sequence[tuple[int, int]]
-    """(width, height) that each camera's images have."""
-    given: GivenMasks
-    shipped: Callable[[RecordedImage], Masks] = lambda shot: {}
-    """Masks of the data set itself; those that are given replace them kind by kind."""
-    said: str = "its calibration is for"
-    """Where the sizes are from."""
-
-    def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-        path, camera = Path(str(shot.key)), self.rig[shot.camera]
-        check_size(path, self.recorded_sizes[shot.camera], self.said)
-        return read_image(path, camera.size, camera.undistortion)
-
-    def masks(self, shot: RecordedImage) -> Masks:
-        camera = self.rig[shot.camera]
-        return dict(self.shipped(shot)) | self.given.read(
-            camera.name,
-            shot.stem,
-            recorded_size=self.recorded_sizes[shot.camera],
-            size=camera.size,
-            undistortion=camera.undistortion,
-        )
-
-
-def check_size(path: Path, size: tuple[int, int], said: str = Pixels.said) -> None:
-    """Raise LogError unless the header has this (width, height), which is ``said`` somewhere; nothing is decoded."""
-    found = image_size(path)
-    if found != size:
-        message = "the image is {}x{}, {} {}x{}".format(*found, said, *size)
-        raise fault(path, message, "copy images and calibration from the same archive")
 
 
 def check_recording(recording: Recording) -> list[Problem]:
@@ -394,33 +318,6 @@ class RecordedReader(LogReader):
         for camera in recording.rig:
             own = [shot for shot in recording.shots if shot.camera == camera.index]
             yield from image_notes(camera.name, [path for shot in own if (path := shot.path) is not None])
-
-
-def read_shot(rig: Sequence[RigCamera], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-    """Return the pixels of an image that is a file of its own, as its camera has them."""
-    camera = rig[shot.camera]
-    return read_image(shot.file, camera.size, camera.undistortion)
-
-
-def read_given(rig: Sequence[RigCamera], given: GivenMasks, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
-    """Return what somebody made of an image that is a file of its own, as its camera has the pixels."""
-    camera, stem = rig[shot.camera], shot.stem
-    if given.root is None:
-        return {}
-    recorded = image_size(shot.file)
-    return given.read(camera.name, stem, recorded_size=recorded, size=camera.size, undistortion=camera.undistortion)
-
-
-def given_or_rows(
-    rig: Sequence[RigCamera], given: GivenMasks, rows: Mapping[str, tuple[int, int]], shot: RecordedImage
-) -> dict[str, Bool[Tensor, "h w"]]:
-    """Return what somebody made; of the recording car, where that is absent, the lowest rows.
-
-    ``rows``: camera -> how many show the car, and of how many.
-    """
-    camera = rig[shot.camera]
-    own = {"ego": bottom_rows(camera.size, *rows[camera.name])} if camera.name in rows else {}
-    return own | read_given(rig, given, shot)
 
 
 def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[], list[Problem]]) -> DrivingLog:

@@ -14,7 +14,8 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_warnings import log_warnings
 from sparsestreet.data.problems import LogError, fault
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording, log_of
+from sparsestreet.data.recorded_images import RecordedImage
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera, rig_camera
 from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.lenses import Fisheye, Lens, Rational

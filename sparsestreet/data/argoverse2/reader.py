@@ -18,15 +18,8 @@ from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.poses import PosePath, check_extent, rigid_poses
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
-from sparsestreet.data.recording import (
-    Boxes,
-    LidarSweep,
-    RecordedImage,
-    RecordedReader,
-    Recording,
-    given_or_rows,
-    read_shot,
-)
+from sparsestreet.data.recorded_images import RecordedImage, given_or_rows, read_shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 
 MAX_BYTES = 64_000_000

@@ -30,15 +30,8 @@ from sparsestreet.data.kitti.files import (
 from sparsestreet.data.poses import PosePath, check_extent, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
-from sparsestreet.data.recording import (
-    Boxes,
-    LidarSweep,
-    Pixels,
-    RecordedImage,
-    RecordedReader,
-    Recording,
-    check_recording,
-)
+from sparsestreet.data.recorded_images import Pixels, RecordedImage
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
 from sparsestreet.geometry.cameras import transform_points
 
 EARTH_RADIUS = 6378137.0

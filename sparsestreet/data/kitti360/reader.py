@@ -33,17 +33,8 @@ from sparsestreet.data.kitti360.files import (
 from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, check_rigid, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
-from sparsestreet.data.recording import (
-    Boxes,
-    LidarSweep,
-    Masks,
-    Pixels,
-    RecordedImage,
-    RecordedReader,
-    Recording,
-    check_recording,
-    check_size,
-)
+from sparsestreet.data.recorded_images import Masks, Pixels, RecordedImage, check_size
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.cameras import rigidity_error, transform_points
 

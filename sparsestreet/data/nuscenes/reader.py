@@ -21,16 +21,8 @@ from sparsestreet.data.nuscenes.tables import LIDAR, DataFile, Row, SceneFiles, 
 from sparsestreet.data.poses import check_extent
 from sparsestreet.data.problems import LogError, Problem, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles, hash_files
-from sparsestreet.data.recording import (
-    Boxes,
-    LidarSweep,
-    Masks,
-    Pixels,
-    RecordedImage,
-    RecordedReader,
-    Recording,
-    check_recording,
-)
+from sparsestreet.data.recorded_images import Masks, Pixels, RecordedImage
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.geometry.cameras import transform_points
 

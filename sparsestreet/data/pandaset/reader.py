@@ -29,15 +29,8 @@ from sparsestreet.data.pandaset.tables import (
 from sparsestreet.data.poses import check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recording import (
-    Boxes,
-    LidarSweep,
-    RecordedImage,
-    RecordedReader,
-    Recording,
-    given_or_rows,
-    read_shot,
-)
+from sparsestreet.data.recorded_images import RecordedImage, given_or_rows, read_shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.geometry.cameras import inverse, transform_points
 

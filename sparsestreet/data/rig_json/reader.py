@@ -25,15 +25,8 @@ from sparsestreet.data.problems import (
     missing_notes,
 )
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recording import (
-    Boxes,
-    LidarSweep,
-    RecordedImage,
-    RecordedReader,
-    Recording,
-    read_given,
-    read_shot,
-)
+from sparsestreet.data.recorded_images import RecordedImage, read_given, read_shot
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.rig_json.table import (
     CameraEntry,

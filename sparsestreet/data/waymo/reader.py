@@ -17,7 +17,8 @@ from sparsestreet.data.lidar import check_points
 from sparsestreet.data.poses import PosePath, check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedImage, RecordedReader, Recording, check_recording
+from sparsestreet.data.recorded_images import RecordedImage
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import camera_at, middle, read_boxes, shutter
 from sparsestreet.data.waymo.segment import (
