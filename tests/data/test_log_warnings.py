@@ -229,6 +229,7 @@ FAULTS = {
         lambda: seen(principal(80.0, 50.0)),
         "is at 80.0, 50.0 of 80x50 pixels, outside",
     ),
+    "principal point below 0": (lambda: seen(principal(-5.0, 27.0)), "is at -5.0, 27.0 of 80x50 pixels, outside"),
     "cx and cy exchanged": (lambda: seen(principal(25.5, 37.0)), "as if cx and cy were exchanged"),
     "us for ns": (lambda: seen(slower(1e-3)), "moves by 8,007 m/s and takes 9,000 images a second"),
     "ns for us": (lambda: seen(slower(1e3)), "takes 0.009 images a second: the stamps may be in a finer unit"),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from PIL import Image
 
 from sparsestreet.data.pandaset import PandaSetReader
 from sparsestreet.data.pandaset.tables import CAMERA_FROM_LIDAR
@@ -133,6 +134,15 @@ def test_rows_of_the_own_car_are_marked_in_the_back_camera(sequence):
     # 260 of 1080 rows are 5.8 of 24.
     assert there(back.ego).sum(1).tolist() == [0] * 18 + [32] * 6
     assert front.ego is None
+    given = sequence / "masks/ego/back_camera"
+    given.mkdir(parents=True)
+    for frame in range(4):
+        Image.fromarray(np.eye(24, 32, dtype=np.uint8) * 255).save(given / f"{frame:02d}.png")
+    reader = PandaSetReader(root=sequence, cameras=["back_camera"], masks=sequence / "masks", width=16)
+    assert reader.check() == []
+    # What somebody made counts in place of the rows; at half its size, every pixel that the diagonal touches.
+    assert there(reader.read().frames[0].ego).diagonal().all()
+    assert int(there(reader.read().frames[0].ego).sum()) < 40
 
 
 def test_without_lidar_boxes_have_the_stamps_of_their_instants(sequence):

@@ -124,6 +124,7 @@ POINTS = {
         lambda path: path.write_bytes(re.sub(rb"\(\d+, 4\), } {8}", b"(99999999999, 4), }", path.read_bytes())),
         "the file is no array",
     ),
+    "in rows of 5": (lambda path: np.save(path, np.zeros((3, 5))), "not numbers in rows of 4"),
     "of NaN": (lambda path: np.save(path, np.array([[0, 1, 2, math.nan]])), "1 of 1 points are NaN"),
     "times in nanoseconds": (lambda path: np.save(path, np.array([[5e7, 1, 2, 3]])), "times must lie within 1 s"),
     "times outside of the drive": (lambda path: np.save(path, np.array([[0.9, 1, 2, 3]])), "instants lie up to"),

@@ -217,6 +217,10 @@ def test_the_recording_car(written):
     frames = RigJsonReader(root=folder).read().frames
     assert frames[0].ego is None
     assert torch.equal(there(frames[1].ego), torch.from_numpy(hood > 0))
+    hood[0, :2] = 90, 150
+    Image.fromarray(hood).save(folder / "hood.png")
+    (problem,) = RigJsonReader(root=folder).check()  # once, though it is that of four images
+    assert (problem.path.name, "4 values" in problem.message) == ("hood.png", True)
 
 
 def test_the_own_mask_and_the_given_one_are_one(written):
