@@ -106,7 +106,11 @@ class _Array(np.ndarray):
 
     def __setstate__(self, state: Any) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         version, shape, kind, fortran, data = state
-        super().__setstate__((version, shape, _numpy_type(kind), fortran, data))
+        numbers = _numpy_type(kind)
+        # NumPy follows the missing pointers of a list that is shorter than the shape, and the process ends.
+        if numbers.hasobject and len(data) != math.prod(shape):
+            raise ValueError(f"it holds {len(data)} objects for an array of shape {shape}")
+        super().__setstate__((version, shape, numbers, fortran, data))
 
 
 class _Joblib:

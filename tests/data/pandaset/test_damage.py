@@ -277,3 +277,11 @@ def test_pandas_reads_the_tables_of_these_tests_as_we_do(era, tmp_path):
             again = read_columns(path, kinds)
             for name in kinds:
                 np.testing.assert_array_equal(again[name], ours[name])
+
+
+def test_a_list_shorter_than_its_array_is_refused_before_numpy_reads_beyond_it(tmp_path):
+    content = pickle.dumps(np.array(["car", "bus"], dtype=object), protocol=2)
+    assert content.count(b"K\x02\x85") == 1  # the shape
+    (tmp_path / "00.pkl").write_bytes(content.replace(b"K\x02\x85", b"K\x09\x85"))
+    with pytest.raises(LogError, match=r"it holds 2 objects for an array of shape \(9,\)"):
+        read_columns(tmp_path / "00.pkl", {"x": str})
