@@ -35,7 +35,7 @@ $(VENV)/.ok: pyproject.toml constraints.txt CMakeLists.txt .cache/modules $(wild
 PROCESSES ?= $(shell test "$$(getconf _NPROCESSORS_ONLN)" -gt 3 && echo 4 || echo 2)
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(PROCESSES) --dist loadfile --no-loadscope-reorder
 
-quick: style ## the loop of daily work, under a minute: style and unit tests without trainings and Triton's interpreter
+quick: style ## the loop of daily work, one to three minutes: style and unit tests without trainings and Triton's interpreter
 	$(PYTEST) --ignore=tests/cli -m 'not slow and not lengthy and not interpreted'
 
 elsewhere: $(VENV)/.ok ## the fast tests as on another processor, in another time zone, locale and order of hashes
