@@ -164,6 +164,10 @@ class View:
         return self.frame_index, self.camera_index
 
 
+MASK_KINDS = ("sky", "human", "vehicle", "ego")
+"""Fields of a frame that are masks."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Frame(View):
     """A view with its image and what is known about its pixels. A recorded frame has both indices."""

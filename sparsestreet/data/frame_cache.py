@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, Int32, UInt8
 from torch import Tensor
 
-from sparsestreet.types import Camera, Frame
+from sparsestreet.types import MASK_KINDS, Camera, Frame
 
 T = TypeVar("T")
 
@@ -128,9 +128,6 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_open_all)
 
 
-_MASKS = ("sky", "human", "vehicle", "ego")
-
-
 @dataclass(frozen=True)
 class PackedFrame:
     """All of a frame, bit for bit. At 960x640 it takes 2.4 MB where a frame with four masks and a depth takes 6.8."""
@@ -145,9 +142,9 @@ class PackedFrame:
 
     @staticmethod
     def of(frame: Frame) -> "PackedFrame":
-        masks = {name: mask.numpy() for name in _MASKS if (mask := getattr(frame, name)) is not None}
+        masks = {name: mask.numpy() for name in MASK_KINDS if (mask := getattr(frame, name)) is not None}
         bits = np.packbits(np.stack(list(masks.values()))) if masks else np.zeros(0, np.uint8)
-        none: dict[str, None] = dict.fromkeys((*_MASKS, "depth"))
+        none: dict[str, None] = dict.fromkeys((*MASK_KINDS, "depth"))
         depth = None if frame.depth is None else Returns.of(frame.depth)
         return PackedFrame(replace(frame, **none), tuple(masks), bits, depth)
 

@@ -23,6 +23,7 @@ from torch import Tensor
 from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.rig import Undistortion
+from sparsestreet.types import MASK_KINDS
 
 logger = logging.getLogger(__name__)
 
@@ -392,9 +393,6 @@ def number_lines(numbers: Float[np.ndarray, "..."] | Sequence[float]) -> bytes:
     file = BytesIO()
     np.savetxt(file, numbers)
     return file.getvalue()
-
-
-MASK_KINDS = ("sky", "human", "vehicle", "ego")
 
 
 @dataclass(frozen=True)

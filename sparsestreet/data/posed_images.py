@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
-from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_mask
+from sparsestreet.data.images import check_camera_images, check_image_sizes, read_mask
 from sparsestreet.data.poses import check_extent, check_rigid
 from sparsestreet.data.problems import (
     LogError,
@@ -30,9 +30,9 @@ from sparsestreet.data.problems import (
     missing_notes,
 )
 from sparsestreet.data.reader import LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recorded_images import RecordedImage, read_given, read_shot
+from sparsestreet.data.recorded_images import Pixels, RecordedImage
 from sparsestreet.data.recording import RecordedReader, Recording
-from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
+from sparsestreet.data.rig import check_lens_camera, lens_camera
 from sparsestreet.geometry.lenses import Lens
 
 
@@ -163,13 +163,14 @@ class PosedReader(RecordedReader):
             for camera in rig
             if (image := instant.get(camera.name)) is not None
         ]
+        pixels = Pixels(rig, [size for _, size in images.cameras.values()], self.given)
         has_own = any(image.valid for image in images.images)
         return Recording(
             name=self.folder.resolve().name,
             rig=rig,
             shots=shots,
-            read_image=partial(read_shot, rig),
-            read_masks=partial(_masks, rig, self.given),
+            read_image=pixels.image,
+            read_masks=partial(_masks, pixels),
             mask_kinds=self.given.kinds.union({"ego"} if has_own else ()),
             sparse_points=None if table.points is None else partial(self._scaled_points, table.points),
             points_file=table.points,
@@ -220,8 +221,8 @@ class PosedReader(RecordedReader):
 def _missing_points(table: PosedTable) -> list[Problem]:
     if table.points is None or table.points.is_file():
         return []
-    message = f"the file is missing, which {table.path.name} names as the one of its points"
-    return [Problem(table.points, message, "write it, or remove its name")]
+    message = f"the file is missing, which {table.path.name} names as that of its points"
+    return [Problem(table.points, message, f"write it, or remove the entry of {table.path.name} that names it")]
 
 
 def natural(key: object) -> list[tuple[int, float | int, str]]:
@@ -257,10 +258,10 @@ def _camera_names(images: Sequence[PosedImage]) -> dict[tuple[str, Lens, tuple[i
     return named
 
 
-def _masks(rig: Sequence[RigCamera[str]], given: GivenMasks, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
+def _masks(pixels: Pixels, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
     """Those that the data set and the user have; what either excludes is excluded."""
     assert isinstance(shot.key, PosedImage)
-    camera, masks = rig[shot.camera], read_given(rig, given, shot)
+    camera, masks = pixels.rig[shot.camera], pixels.masks(shot)
     if shot.key.valid is None:
         return masks
     # The nearest pixel: between black and white nothing is valid in part.

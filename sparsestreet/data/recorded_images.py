@@ -53,7 +53,7 @@ Masks = Mapping[str, Bool[Tensor, "h w"]]
 
 @dataclass(frozen=True)
 class Pixels:
-    """Decodes images whose files are the keys of their shots, and the masks of these."""
+    """Decodes images that are files of their own, and their masks, as the cameras of a rig have the pixels."""
 
     rig: Sequence[RigCamera[str]]
     recorded_sizes: Sequence[tuple[int, int]]
@@ -65,11 +65,13 @@ class Pixels:
     """Where the sizes are from."""
 
     def image(self, shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-        path, camera = Path(str(shot.key)), self.rig[shot.camera]
-        check_size(path, self.recorded_sizes[shot.camera], self.said)
-        return read_image(path, camera.size, camera.undistortion)
+        """Raise LogError for a broken file, or one of another size than the camera's."""
+        camera = self.rig[shot.camera]
+        check_size(shot.file, self.recorded_sizes[shot.camera], self.said)
+        return read_image(shot.file, camera.size, camera.undistortion)
 
-    def masks(self, shot: RecordedImage) -> Masks:
+    def masks(self, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
+        """Kind -> mask. Raise LogError for a broken file, or one of another size than the camera's images."""
         camera = self.rig[shot.camera]
         return dict(self.shipped(shot)) | self.given.read(
             camera.name,
@@ -88,28 +90,10 @@ def check_size(path: Path, size: tuple[int, int], said: str = Pixels.said) -> No
         raise fault(path, message, "copy images and calibration from the same archive")
 
 
-def read_shot(rig: Sequence[RigCamera], shot: RecordedImage) -> UInt8[Tensor, "h w 3"]:
-    """Return the pixels of an image that is a file of its own, as its camera has them."""
-    camera = rig[shot.camera]
-    return read_image(shot.file, camera.size, camera.undistortion)
+def lowest_rows(rig: Sequence[RigCamera[str]], rows: Mapping[str, tuple[int, int]]) -> Callable[[RecordedImage], Masks]:
+    """Return masks of the recording car, for ``Pixels.shipped``.
 
-
-def read_given(rig: Sequence[RigCamera], given: GivenMasks, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
-    """Return what somebody made of an image that is a file of its own, as its camera has the pixels."""
-    camera, stem = rig[shot.camera], shot.stem
-    if given.root is None:
-        return {}
-    recorded = image_size(shot.file)
-    return given.read(camera.name, stem, recorded_size=recorded, size=camera.size, undistortion=camera.undistortion)
-
-
-def given_or_rows(
-    rig: Sequence[RigCamera], given: GivenMasks, rows: Mapping[str, tuple[int, int]], shot: RecordedImage
-) -> dict[str, Bool[Tensor, "h w"]]:
-    """Return what somebody made; of the recording car, where that is absent, the lowest rows.
-
-    ``rows``: camera -> how many show the car, and of how many.
+    ``rows``: camera -> how many of its lowest rows show the car, and of how many.
     """
-    camera = rig[shot.camera]
-    own = {"ego": bottom_rows(camera.size, *rows[camera.name])} if camera.name in rows else {}
-    return own | read_given(rig, given, shot)
+    masks = {one.index: {"ego": bottom_rows(one.size, *rows[one.name])} for one in rig if one.name in rows}
+    return lambda shot: masks.get(shot.camera, {})

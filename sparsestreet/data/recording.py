@@ -20,9 +20,7 @@ from torch import Tensor
 
 from sparsestreet.data.frame_cache import CacheSize, FrameCache, MemoryForecast, cache_bytes
 from sparsestreet.data.images import (
-    MASK_KINDS,
     GivenMasks,
-    check_camera_images,
     image_notes,
     joined,
     read_transparent,
@@ -38,7 +36,7 @@ from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.timestamps import LogClock
 from sparsestreet.data.tracks import checked_track, repeated, timed_tracks, track_in_window
 from sparsestreet.geometry.boxes import CarriedPoints, without_frames
-from sparsestreet.types import Frame, SparsePoints, Sweep, Track, View
+from sparsestreet.types import MASK_KINDS, Frame, SparsePoints, Sweep, Track, View
 
 T = TypeVar("T")
 
@@ -232,17 +230,6 @@ class Recording:
     """What a user should know about how it was read, one sentence each."""
 
 
-def check_recording(recording: Recording) -> list[Problem]:
-    """What is wrong with images, masks and points, all of which are decoded, one at a time."""
-    problems: list[Problem] = []
-    for shot in recording.shots:
-        attempt(problems, partial(recording.read_image, shot))
-        attempt(problems, partial(recording.read_masks, shot))
-    for sweep in (recording.sweeps or {}).values():
-        attempt(problems, sweep.read)
-    return problems
-
-
 @dataclass(frozen=True, kw_only=True)
 class RecordedReader(LogReader):
     """A data set as its publisher ships it. Subclasses say how to find and decode its files."""
@@ -278,13 +265,11 @@ class RecordedReader(LogReader):
         wanted part is not there."""
 
     def check_contents(self) -> list[Problem]:
-        """What is wrong with pixels and points, all of which are decoded; here of images that are files."""
+        """What is wrong with images, masks and points, all of which are decoded, one at a time."""
         recording = self.recording()
         problems: list[Problem] = []
-        for camera in recording.rig:
-            paths = [shot.path for shot in recording.shots if shot.camera == camera.index and shot.path is not None]
-            problems += check_camera_images(camera.name, paths, (), decode=True)
-        for shot in recording.shots if recording.mask_kinds else ():
+        for shot in recording.shots:
+            attempt(problems, partial(recording.read_image, shot))
             attempt(problems, partial(recording.read_masks, shot))
         for sweep in (recording.sweeps or {}).values():
             attempt(problems, sweep.read)

@@ -18,7 +18,7 @@ from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.poses import PosePath, check_extent, rigid_poses
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
-from sparsestreet.data.recorded_images import RecordedImage, given_or_rows, read_shot
+from sparsestreet.data.recorded_images import Pixels, RecordedImage, lowest_rows
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 
@@ -402,12 +402,13 @@ class Argoverse2Reader(RecordedReader):
         problems = check_extent(placed) + self.given.check((rig[shot.camera].name, shot.stem) for shot in shots)
         if problems:
             raise LogError(problems)
+        pixels = Pixels(rig, [mounts[camera.name].size for camera in rig], self.given, lowest_rows(rig, EGO_ROWS))
         return Recording(
             name=chosen.layout.root.resolve().name,
             rig=rig,
             shots=shots,
-            read_image=partial(read_shot, rig),
-            read_masks=partial(given_or_rows, rig, self.given, EGO_ROWS),
+            read_image=pixels.image,
+            read_masks=pixels.masks,
             mask_kinds=self.given.kinds.union({"ego"} if EGO_ROWS.keys() & chosen.images.keys() else ()),
             frame_stamps=chosen.instants,
             sweeps=_sweeps(chosen, path) if self.lidar else None,

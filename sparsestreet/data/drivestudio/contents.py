@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.drivestudio.layout import MASK_KINDS, NAME_IT, Layout, read_numbers
+from sparsestreet.data.drivestudio.layout import FOLDER_KINDS, NAME_IT, Layout, read_numbers
 from sparsestreet.data.images import (
     image_notes,
     image_size,
@@ -84,7 +84,7 @@ def hashed_files(layout: Layout) -> LogFiles:
 def _pixel_files(layout: Layout) -> list[Path]:
     """Images, and the masks of the kinds that the log has."""
     files = [layout.image(frame, camera) for frame, camera in layout.images]
-    for kind in MASK_KINDS:
+    for kind in FOLDER_KINDS:
         paths = [layout.mask(kind, frame, camera) for frame, camera in layout.images]
         files += [path for path in paths if path is not None]
     return files
@@ -198,7 +198,7 @@ def read_frame(layout: Layout, rig: Sequence[RigCamera[int]], view: View) -> Fra
     frame_index, camera_index = view.indices
     number, camera = layout.frames[frame_index], rig[camera_index]
     lens = camera.undistortion
-    paths = {kind: layout.mask(kind, number, camera.name) for kind in MASK_KINDS}
+    paths = {kind: layout.mask(kind, number, camera.name) for kind in FOLDER_KINDS}
     masks = {
         kind: None if path is None else read_mask(path, camera.size, sky=kind == "sky", undistortion=lens)
         for kind, path in paths.items()

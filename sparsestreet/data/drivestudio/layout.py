@@ -252,7 +252,8 @@ class Layout:
         return None if folder is None else folder / f"{frame:03d}_{camera}.png"
 
 
-MASK_KINDS = ("sky", "human", "vehicle")
+FOLDER_KINDS = ("sky", "human", "vehicle")
+"""Kinds of masks that have a folder, with a file for each image; that of the recording car is apart."""
 
 
 def find_layout(

@@ -31,7 +31,7 @@ from sparsestreet.data.drivestudio.contents import (
     required_files,
     sweep_notes,
 )
-from sparsestreet.data.drivestudio.layout import MASK_KINDS, FlavorName, Layout, find_layout
+from sparsestreet.data.drivestudio.layout import FOLDER_KINDS, FlavorName, Layout, find_layout
 from sparsestreet.data.frame_cache import CacheSize, cache_bytes
 from sparsestreet.data.images import check_camera_images, image_size
 from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath, absence_notes
@@ -97,7 +97,7 @@ def _check_images(layout: Layout, contents: bool) -> list[Problem]:
     problems: list[Problem] = []
     for camera in layout.cameras:
         images = [layout.image(frame, camera) for frame in layout.frames]
-        masks = [layout.mask(kind, frame, camera) for kind in MASK_KINDS for frame in layout.frames]
+        masks = [layout.mask(kind, frame, camera) for kind in FOLDER_KINDS for frame in layout.frames]
         masks = [path for path in (*masks, layout.ego_mask(camera)) if path is not None]
         problems += check_camera_images(camera, images, masks, decode=contents)
     return problems

@@ -31,7 +31,7 @@ from sparsestreet.data.drivestudio.annotations import (
     seconds_lines,
     written_tracks,
 )
-from sparsestreet.data.drivestudio.layout import EGO_MASKS, FINE_MASKS, MASK_KINDS, SKY_MASKS, Layout
+from sparsestreet.data.drivestudio.layout import EGO_MASKS, FINE_MASKS, FOLDER_KINDS, SKY_MASKS, Layout
 from sparsestreet.data.images import jpeg, mask_png, number_lines, png
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.log import DrivingLog
@@ -48,7 +48,7 @@ class MaskKinds:
     """What was found in the images of a log."""
 
     everywhere: tuple[str, ...]
-    """Those of MASK_KINDS that every image has."""
+    """Those of FOLDER_KINDS that every image has."""
     lacking: Mapping[str, tuple[int, int]]
     """The other kinds, and frame and camera of the first image without."""
     ego: Mapping[int, Frame]
@@ -62,10 +62,10 @@ def find_masks(frames: Frames) -> MaskKinds:
     """Decode images until no more kind can be in all of them: a few of a log without masks, else all."""
     lacking: dict[str, tuple[int, int]] = {}
     for frame in frames:
-        for kind in MASK_KINDS:
+        for kind in FOLDER_KINDS:
             if kind not in lacking and getattr(frame, kind) is None:
                 lacking[kind] = frame.indices
-        if len(lacking) == len(MASK_KINDS):
+        if len(lacking) == len(FOLDER_KINDS):
             break
     ego, changing = {}, []
     for camera in sorted({view.indices[1] for view in frames.views}):
@@ -76,7 +76,7 @@ def find_masks(frames: Frames) -> MaskKinds:
             changing.append(camera)
         elif first.ego is not None:
             ego[camera] = first
-    everywhere = tuple(kind for kind in MASK_KINDS if kind not in lacking)
+    everywhere = tuple(kind for kind in FOLDER_KINDS if kind not in lacking)
     return MaskKinds(everywhere, lacking, ego, tuple(changing))
 
 

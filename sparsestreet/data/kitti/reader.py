@@ -31,7 +31,7 @@ from sparsestreet.data.poses import PosePath, check_extent, untwisted
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recorded_images import Pixels, RecordedImage
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.geometry.cameras import transform_points
 
 EARTH_RADIUS = 6378137.0
@@ -254,9 +254,6 @@ class KittiReader(RecordedReader):
             notes=(_POSES, *parts.clock.notes, *self._notes(drive, parts)),
         )
 
-    def check_contents(self) -> list[Problem]:
-        return check_recording(self.recording())
-
     def files(self) -> LogFiles:
         """Those of the chosen frames and cameras, lidar too where it is not wanted."""
         drive = self._drive()
@@ -274,7 +271,8 @@ class KittiReader(RecordedReader):
         drive = self._drive()
         images = [drive.image(camera, frame) for camera, frame in product(drive.cameras, drive.frames)]
         problems = missing_files([*images, *map(drive.oxts, drive.frames)])
-        problems += self.given.check((path.parts[-3], path.stem) for path in images)
+        stems = (drive.image("", frame).stem for frame in drive.frames)
+        problems += self.given.check(product(drive.cameras, stems))
         calibration = attempt(problems, lambda: read_calibration(drive.folder.parent, drive.cameras))
         clock = attempt(problems, lambda: read_clock(drive))
         oxts, poses = _read_poses(drive, problems)

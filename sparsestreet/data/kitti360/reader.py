@@ -31,10 +31,10 @@ from sparsestreet.data.kitti360.files import (
     read_poses,
 )
 from sparsestreet.data.poses import RIGIDITY_TOLERANCE, PosePath, are_rigid, check_extent, check_rigid, untwisted
-from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
+from sparsestreet.data.problems import LogError, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles
 from sparsestreet.data.recorded_images import Masks, Pixels, RecordedImage, check_size
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, lens_camera
 from sparsestreet.geometry.cameras import rigidity_error, transform_points
 
@@ -113,9 +113,6 @@ class Kitti360Reader(RecordedReader):
             notes=self._notes(sequence, parts, len(labeled)),
         )
 
-    def check_contents(self) -> list[Problem]:
-        return check_recording(self.recording())
-
     def files(self) -> LogFiles:
         """Those of the chosen frames and cameras, lidar too where it is not wanted."""
         sequence = self._sequence()
@@ -148,7 +145,8 @@ class Kitti360Reader(RecordedReader):
         frames = self._window(sequence, poses)
         images = [sequence.image(camera, frame) for camera, frame in product(sequence.cameras, frames)]
         problems = missing_files(images)
-        problems += self.given.check((path.parts[-3], path.stem) for path in images)
+        stems = (sequence.image("", frame).stem for frame in frames)
+        problems += self.given.check(product(sequence.cameras, stems))
         if not are_rigid(torch.stack([poses[frame] for frame in frames])):
             for frame in frames:
                 attempt(problems, partial(check_rigid, poses[frame], sequence.poses, f"the pose of frame {frame}"))

@@ -11,18 +11,17 @@ from typing import get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
-from sparsestreet.data.hood import bottom_rows
 from sparsestreet.data.lidar import sensor_points
 from sparsestreet.data.nuscenes.selection import Rate, Selection, select
 from sparsestreet.data.nuscenes.tables import LIDAR, DataFile, Row, SceneFiles, all_rows, pose_of, rows_of_tokens
 from sparsestreet.data.poses import check_extent
-from sparsestreet.data.problems import LogError, Problem, missing_files
+from sparsestreet.data.problems import LogError, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles, hash_files
-from sparsestreet.data.recorded_images import Masks, Pixels, RecordedImage
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
+from sparsestreet.data.recorded_images import Pixels, RecordedImage, lowest_rows
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.geometry.cameras import transform_points
 
@@ -51,12 +50,6 @@ def camera_intrinsics(scene: SceneFiles, name: str, files: Sequence[DataFile]) -
         if not np.array_equal(one, intrinsics[0]):
             raise file.row.fault("calibrated_sensor_token", f"must have the intrinsics of all {name}", one.tolist())
     return intrinsics[0]
-
-
-def ego_mask(scene: str, camera: RigCamera[str]) -> Bool[Tensor, "h w"] | None:
-    """True where the recording car is seen, at the camera's size; None where it is not."""
-    rows = {**EGO_ROWS, **_EGO_ROWS_OF_SCENES.get(scene, {})}.get(camera.name)
-    return None if rows is None else bottom_rows(camera.size, rows, _HEIGHT)
 
 
 def _intrinsics(scene: SceneFiles, file: DataFile) -> Float64[np.ndarray, "3 3"]:
@@ -216,19 +209,16 @@ class NuScenesReader(RecordedReader):
         if far := check_extent(_placed(shots, boxes or ())):
             raise LogError(far)
         sizes = [recorded_size(chosen.images_of(camera.index)) for camera in rig]
-        egos = {camera.index: ego for camera in rig if (ego := ego_mask(chosen.scene.name, camera)) is not None}
-
-        def shipped(shot: RecordedImage) -> Masks:
-            return {"ego": egos[shot.camera]} if shot.camera in egos else {}
-
-        pixels = Pixels(rig, sizes, self.given, shipped, "sample_data.json says")
+        rows = EGO_ROWS | _EGO_ROWS_OF_SCENES.get(chosen.scene.name, {})
+        ego = lowest_rows(rig, {name: (count, _HEIGHT) for name, count in rows.items()})
+        pixels = Pixels(rig, sizes, self.given, ego, "sample_data.json says")
         return Recording(
             name=chosen.scene.name,
             rig=rig,
             shots=shots,
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=frozenset(["ego"] if egos else ()).union(self.given.kinds),
+            mask_kinds=self.given.kinds.union({"ego"} if rows.keys() & set(chosen.cameras) else ()),
             # Behind the last image there are no frames.
             frame_stamps=tuple(chosen.instants.stamps[instant] for instant in chosen.window)[: 1 + shots[-1].frame],
             sweeps=self._sweeps(),
@@ -237,9 +227,6 @@ class NuScenesReader(RecordedReader):
             vehicle=chosen.vehicle(),
             notes=(*chosen.notes(), *notes),
         )
-
-    def check_contents(self) -> list[Problem]:
-        return check_recording(self.recording())
 
     def files(self) -> LogFiles:
         """Images and sweeps; ``data_hash`` adds the rows of the tables, which are those of many scenes."""

@@ -296,6 +296,9 @@ def select(
     instants = find_instants(files, rate)
     window = frame_window(len(instants.stamps), first_frame, last_frame, root)
     selection = Selection(files, rate, instants, window, chosen_cameras(files.cameras, cameras, root), choice)
-    if not selection.images:
-        raise ValueError(f"none of {', '.join(selection.cameras)} has an image in frames {first_frame} to {last_frame}")
+    if blank := [name for index, name in enumerate(selection.cameras) if not selection.images_of(index)]:
+        raise ValueError(
+            f"frames {first_frame} to {last_frame} hold no image of {', '.join(blank)}: read other frames, or name "
+            "cameras that have some (data.log.cameras)"
+        )
     return selection

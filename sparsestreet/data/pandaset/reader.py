@@ -29,7 +29,7 @@ from sparsestreet.data.pandaset.tables import (
 from sparsestreet.data.poses import check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recorded_images import RecordedImage, given_or_rows, read_shot
+from sparsestreet.data.recorded_images import Pixels, RecordedImage, lowest_rows
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera
 from sparsestreet.geometry.cameras import inverse, transform_points
@@ -187,12 +187,14 @@ class PandaSetReader(RecordedReader):
         problems += self.given.check((rig[shot.camera].name, shot.stem) for shot in shots)
         if problems:
             raise LogError(problems)
+        sizes = [_recorded_size(chosen, camera.name) for camera in rig]
+        pixels = Pixels(rig, sizes, self.given, lowest_rows(rig, EGO_ROWS), "the first image of the camera is")
         return Recording(
             name=chosen.layout.root.resolve().name,
             rig=rig,
             shots=shots,
-            read_image=partial(read_shot, rig),
-            read_masks=partial(given_or_rows, rig, self.given, EGO_ROWS),
+            read_image=pixels.image,
+            read_masks=pixels.masks,
             mask_kinds=self.given.kinds.union({"ego"} if EGO_ROWS.keys() & set(chosen.cameras) else ()),
             frame_stamps=tuple(stamps),
             sweeps=sweeps,
@@ -221,8 +223,7 @@ class PandaSetReader(RecordedReader):
         folder = chosen.layout.camera(name)
         if absent := missing_files(chosen.layout.image(name, frame) for frame in chosen.frames):
             raise LogError(absent)
-        size = image_size(chosen.layout.image(name, chosen.frames[0]))
-        return self.pinhole(name, index, read_intrinsics(folder / "intrinsics.json"), size)
+        return self.pinhole(name, index, read_intrinsics(folder / "intrinsics.json"), _recorded_size(chosen, name))
 
     def _sweeps(
         self, chosen: "_Selection", stamps: Sequence[int], world_from_lidar: Float64[Tensor, "f 4 4"]
@@ -314,6 +315,11 @@ def _check_places(
 
 def _points(path: Path, world_from_lidar: Float64[Tensor, "4 4"]) -> Float64[Tensor, "n 3"]:
     return read_returns(path, world_from_lidar).world
+
+
+def _recorded_size(chosen: "_Selection", camera: str) -> tuple[int, int]:
+    """(width, height) of the first image that is read, pixels: the data set does not tell."""
+    return image_size(chosen.layout.image(camera, chosen.frames[0]))
 
 
 def _notes(objects: Objects | None, spin: Spin | None, *, lidar: bool) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.images import GivenMasks, check_camera_images, check_image_sizes, read_mask
+from sparsestreet.data.images import check_camera_images, check_image_sizes, read_mask
 from sparsestreet.data.lidar import check_points, empty_notes, returned
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.poses import PosePath, check_extent, untwisted
@@ -25,7 +25,7 @@ from sparsestreet.data.problems import (
     missing_notes,
 )
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window
-from sparsestreet.data.recorded_images import RecordedImage, read_given, read_shot
+from sparsestreet.data.recorded_images import Pixels, RecordedImage
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens_camera, lens_camera
 from sparsestreet.data.rig_json.table import (
@@ -242,10 +242,9 @@ def _drive(frames: Sequence[FrameEntry]) -> PosePath | None:
     return PosePath(torch.tensor(stamps), torch.stack([pose for _, pose in known]), max_extrapolation=step)
 
 
-def _read_masks(
-    table: RigTable, rig: Sequence[RigCamera[str]], given: GivenMasks, shot: RecordedImage
-) -> dict[str, Bool[Tensor, "h w"]]:
-    camera, masks = rig[shot.camera], read_given(rig, given, shot)
+def _read_masks(table: RigTable, pixels: Pixels, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:
+    """Those that the log and the user have; what either excludes is excluded."""
+    camera, masks = pixels.rig[shot.camera], pixels.masks(shot)
     path = table.cameras[camera.name].ego_mask
     if path is None:
         return masks
@@ -273,14 +272,15 @@ class RigJsonReader(RecordedReader):
         rig, shots = [self._camera(part, index) for index in range(len(part.cameras))], part.shots()
         if problems := self._problems(part, shots):
             raise LogError(problems)
-        ego = any(part.table.cameras[name].ego_mask for name in part.cameras)
+        cameras = [part.table.cameras[name] for name in part.cameras]
+        pixels = Pixels(rig, [camera.size for camera in cameras], self.given, said="rig.json says")
         return Recording(
             name=self.folder.resolve().name,
             rig=rig,
             shots=shots,
-            read_image=partial(read_shot, rig),
-            read_masks=partial(_read_masks, part.table, rig, self.given),
-            mask_kinds=self.given.kinds.union({"ego"} if ego else ()),
+            read_image=pixels.image,
+            read_masks=partial(_read_masks, part.table, pixels),
+            mask_kinds=self.given.kinds.union({"ego"} if any(one.ego_mask for one in cameras) else ()),
             frame_stamps=part.stamps,
             sweeps=part.sweeps(shots) if self.lidar else None,
             boxes=part.boxes(),

@@ -18,7 +18,7 @@ from sparsestreet.data.poses import PosePath, check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
 from sparsestreet.data.recorded_images import RecordedImage
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, check_recording
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
 from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import camera_at, middle, read_boxes, shutter
 from sparsestreet.data.waymo.segment import (
@@ -265,7 +265,7 @@ class WaymoReader(RecordedReader):
         return shots, boxes, notes
 
     def check_contents(self) -> list[Problem]:
-        return _once(self._segment.check_files() + check_recording(self.recording()))
+        return self._segment.check_files() + super().check_contents()
 
     def files(self) -> LogFiles:
         """All components of the segment, lidar too where it is not wanted."""

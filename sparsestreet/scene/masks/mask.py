@@ -67,7 +67,7 @@ class Mask(nn.Module, ABC):
         """
 
 
-def check_mask(sparsity_weight: float, threshold: float) -> None:
+def check_mask(sparsity_weight: float, threshold: float = 0.0) -> None:
     """Raise ValueError for a negative weight, or a threshold outside [0, 1)."""
     if not sparsity_weight >= 0:
         raise ValueError(f"a mask's sparsity_weight must be >= 0, got {sparsity_weight}")

@@ -34,7 +34,7 @@ class SampledMaskSettings:
     """Of all samples, together with the step."""
 
     def __post_init__(self) -> None:
-        check_mask(self.sparsity_weight, _LIKELIER)
+        check_mask(self.sparsity_weight)
         if not self.temperature > 0 or self.draws < 1:
             raise ValueError(
                 f"a sampled mask needs a temperature > 0 and draws >= 1, got {self.temperature} and {self.draws}"

@@ -39,6 +39,7 @@ class LogitMask(Mask):
     """A mask with one logit a row, m, for all times; nothing of it remains after training."""
 
     settings: Any
+    """With ``initial_logit`` and ``sparsity_weight``."""
     columns = (COLUMN,)
 
     def __init__(self, settings: Any, min_gaussians: int = 0) -> None:

@@ -143,6 +143,8 @@ def test_an_image_that_the_tables_lack(tmp_path):
     assert "1 images are not in the tables, so some instants lack cameras" in recording.notes
     recording = NuScenesReader(root=drive.root, cameras=["CAM_FRONT_LEFT"]).recording()
     assert len(there(recording.frame_stamps)) == len(recording.shots) == 3
+    with pytest.raises(ValueError, match=r"frames 3 to 3 hold no image of CAM_FRONT_LEFT: read other frames, or name"):
+        NuScenesReader(root=drive.root, first_frame=3, last_frame=3).recording()
 
 
 def test_objects_that_no_return_hit_are_left_out(tmp_path):

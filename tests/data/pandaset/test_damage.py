@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sparsestreet.data.pandaset import PandaSetReader, frames
 from sparsestreet.data.pandaset.frames import read_columns
@@ -285,3 +286,14 @@ def test_a_list_shorter_than_its_array_is_refused_before_numpy_reads_beyond_it(t
     (tmp_path / "00.pkl").write_bytes(content.replace(b"K\x02\x85", b"K\x09\x85"))
     with pytest.raises(LogError, match=r"it holds 2 objects for an array of shape \(9,\)"):
         read_columns(tmp_path / "00.pkl", {"x": str})
+
+
+def test_an_image_of_another_size_is_no_frame(sequence):
+    with Image.open(sequence / IMAGE) as image:
+        wide, high = image.size
+        image.resize((wide // 2, high // 2)).save(sequence / IMAGE)
+    reader = PandaSetReader(root=sequence)
+    said = f"the image is {wide // 2}x{high // 2}, the first image of the camera is {wide}x{high}"
+    with pytest.raises(LogError, match=said):
+        list(reader.read().frames)
+    assert [(problem.path.name, problem.message) for problem in reader.check_contents()] == [("01.jpg", said)]
