@@ -146,6 +146,13 @@ def test_a_value_that_cannot_be_is_found_before_any_data_is_read(assignment, sai
     assert problem == said if said is None else said in there(problem)
 
 
+def test_flags_may_stand_between_overrides(capsys):
+    assert train(["seed=3", "--cfg", "job", "checkpoint_every=5"]) == 0
+    shown = capsys.readouterr().out
+    assert "seed: 3\n" in shown
+    assert "checkpoint_every: 5\n" in shown
+
+
 def test_the_whole_configuration_can_be_shown_resolved(capsys):
     """With the run's folder, which no app knows yet, and lists that follow from others; what cannot be is one line."""
     assert train(["seed=3", "--cfg", "job", "--resolve", "out=runs/a", "method=omnire"]) == 0

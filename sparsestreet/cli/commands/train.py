@@ -85,12 +85,11 @@ def _without_parts(arguments: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _shown(arguments: list[str]) -> list[str]:
-    """For ``--cfg job --resolve``: the run's folder, which only a running app knows, in the words of ``out``."""
-    if "--resolve" not in arguments:
-        return arguments
-    overrides = without_flags(arguments)
+    """Flags first, wherever they stood; with ``--resolve`` the run's folder, which only a running app knows."""
     # argparse takes overrides only where they stand together.
-    return [*(text for text in arguments if text not in overrides), *overrides, "folder=${out}"]
+    overrides = without_flags(arguments)
+    flags = [text for text in arguments if text not in overrides]
+    return [*flags, *overrides, *(["folder=${out}"] if "--resolve" in arguments else [])]
 
 
 def _problem_of_values(arguments: list[str]) -> str | None:
