@@ -56,6 +56,8 @@ def run(tree: Path, tests: list[str], timeout: float) -> tuple[str, str]:
     by = next(
         (line[7:].split(" - ")[0] for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))), ""
     )
+    if done.returncode < 0:
+        return "killed", f"signal {-done.returncode}"  # the process ended within a test
     if done.returncode == 1 or (done.returncode == 2 and by):
         return "killed", by
     if done.returncode == 0:
