@@ -39,6 +39,9 @@ _LOSSY = ("JPEG", "MPO", "WEBP", "JPEG2000")
 _OUTER = 0.1
 """Of all levels, at either end: what a lossy encoder leaves of black and of white."""
 
+WHITE = 250
+"""Level of 255 from which a channel counts as cut off by the sensor: JPEG moves white by a few levels."""
+
 T = TypeVar("T")
 
 

@@ -10,12 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from sparsestreet.data.images import WHITE
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.types import Frame
 
 MAX_FRAMES = 36
-WHITE = 250
-"""Of 255: a pixel is cut off where red, green and blue have at least this; JPEG moves white by a few levels."""
 MIN_STOPS = 1.25
 """Stops of the stored values below middle gray from which a log is dark: a mean gray level of 50 of 255."""
 MIN_CLIPPED = 0.02

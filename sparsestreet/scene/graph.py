@@ -80,6 +80,14 @@ class SceneGraph(nn.Module):
         found = (effect.exposed(view) for effect in self.effects.values())
         return next((one for one in found if one is not None), None)
 
+    def gain(self, view: View) -> Float[Tensor, "3"]:
+        """Factors by which the camera makes red, green and blue of this view brighter than of others."""
+        factors = torch.ones(3, device=self.device)
+        for effect in self.effects.values():
+            own = effect.gain(view)
+            factors = factors if own is None else factors * own
+        return factors
+
     @torch.no_grad()
     def displacements(self, view: View, parts: Mapping[str, RawGaussians], span: float) -> Float[Tensor, "n 3"]:
         """How far each row moves in the world, meters, during a normalized time around the view's."""

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from sparsestreet.data.images import WHITE
 from sparsestreet.ops import splat
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.ssim import ssim
@@ -28,16 +29,24 @@ class Loss(Protocol):
 
 @dataclass(frozen=True)
 class Photometric(Loss):
-    """On unclamped colors: a clamp would stop the gradient of saturated pixels (lamps, white sky)."""
+    """(1 - lambda) L1 + lambda (1 - SSIM) of colors that are not clamped, but where the sensor was cut off.
+
+    A recorded channel at white says only that at least so much light came: more of it is no error there. A clamp of
+    all colors would stop the gradient also of a pixel that is too bright and was recorded darker.
+    """
 
     weight: float = 1.0
     lambda_dssim: float = 0.2
+    white: int | None = WHITE
+    """Level of 255 from which a recorded channel is a lower bound; None: none is (DriveStudio's loss)."""
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
-        truth = frame.image.to(rendering.rgb.dtype) / 255
-        error = (rendering.rgb - truth).abs().mean()
+        rgb, truth = rendering.rgb, frame.image.to(rendering.rgb.dtype) / 255
+        if self.white is not None:
+            rgb = torch.where(frame.image >= self.white, torch.minimum(rgb, truth), rgb)
+        error = (rgb - truth).abs().mean()
         if self.lambda_dssim > 0:
-            error = (1 - self.lambda_dssim) * error + self.lambda_dssim * (1 - ssim(rendering.rgb, truth))
+            error = (1 - self.lambda_dssim) * error + self.lambda_dssim * (1 - ssim(rgb, truth))
         return self.weight * error
 
 

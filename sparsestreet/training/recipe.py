@@ -120,7 +120,7 @@ class Recipe:
             resolution=self.resolution,
             moved_views=None
             if self.moved_views is None
-            else moved_view_term(self.moved_views, data, self.nodes, self.seed),
+            else moved_view_term(self.moved_views, data, scene, self.nodes, self.seed),
         )
 
 

@@ -21,7 +21,7 @@ from sparsestreet.training.forecast import (
     size_in_words,
 )
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
-from sparsestreet.training.moved_views.returns import Returns, StreetReturns
+from sparsestreet.training.moved_views.returns import Colors, Returns, StreetReturns
 from tests.training.stubs import SplitFrames, StubTrainer, background, frame_at, make_system, rigid
 
 
@@ -68,7 +68,7 @@ def test_moved_views_take_their_part_of_the_steps(monkeypatch):
     system, data = make_system({"background": background(20)}), SplitFrames(Split(frames, as_frames(())))
     monkeypatch.setattr(forecast_module, "_seconds", lambda work, device: 2.0)
     assert measured_step(system, data) == 2.0 * OPTIMIZER
-    one = Returns(torch.ones(1, 3), torch.ones(1, 3), torch.ones(1))
+    one = Returns(torch.ones(1, 3), Colors(torch.ones(1, 3), torch.zeros(1, 3, dtype=torch.bool)), torch.ones(1))
     settings = MovedViews(every=4, start=0.1, stop=0.9)
     system.moved_views = MovedViewTerm(settings, StreetReturns(one, (0,), (0, 1), {}, ()), seed=0)
     # 0.8 of the run, every fourth step.

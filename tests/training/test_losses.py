@@ -76,7 +76,7 @@ def test_photometric_and_its_gradient_equal_numpy_and_kornia(generator):
     dissimilarity = 1 - kornia.metrics.ssim(*planes, window_size=11, padding="valid").mean()
     difference = rgb.detach().numpy() - truth.numpy()
     expected = 3.0 * (0.7 * np.abs(difference).mean() + 0.3 * dissimilarity.item())
-    ours = Photometric(weight=3.0, lambda_dssim=0.3)(rendering(rgb), seen, SCENE)
+    ours = Photometric(weight=3.0, lambda_dssim=0.3, white=None)(rendering(rgb), seen, SCENE)
     assert ours.item() == pytest.approx(expected, rel=1e-8)
     cotangent = torch.randn((), dtype=torch.float64, generator=generator)
     l1_gradient = 3.0 * 0.7 * torch.from_numpy(np.sign(difference)) / difference.size
@@ -86,10 +86,26 @@ def test_photometric_and_its_gradient_equal_numpy_and_kornia(generator):
     torch.testing.assert_close(gradient, cotangent * (l1_gradient + ssim_gradient), rtol=1e-6, atol=1e-12)
 
 
-def test_saturated_pixels_keep_their_gradient():
-    rgb = torch.full((HEIGHT, WIDTH, 3), 1.5, requires_grad=True)
-    Photometric(lambda_dssim=0.0)(rendering(rgb), frame(), SCENE).backward()
-    assert bool((rgb.grad > 0).all())
+@pytest.mark.parametrize("lambda_dssim", [0.0, 0.2])
+def test_where_the_sensor_was_cut_off_more_light_is_no_error(lambda_dssim, generator):
+    """As if the light had been exactly white there; what was recorded darker keeps the pull of its whole error."""
+    term, seen = Photometric(lambda_dssim=lambda_dssim), frame()
+    image = torch.randint(0, 250, (HEIGHT, WIDTH, 3), generator=generator, dtype=torch.uint8)
+    white = torch.rand(HEIGHT, WIDTH, 3, generator=generator) < 0.4
+    image[white] = torch.randint(250, 256, (int(white.sum()),), generator=generator, dtype=torch.uint8)
+    seen = replace(seen, image=image)
+    truth = image.double() / 255
+    drawn = torch.rand(HEIGHT, WIDTH, 3, generator=generator, dtype=torch.float64) * 1.5
+    light = drawn.clone().requires_grad_()
+    exact = torch.where(white & (drawn > truth), truth, drawn).requires_grad_()
+    losses = [term(rendering(light), seen, SCENE), replace(term, white=None)(rendering(exact), seen, SCENE)]
+    assert losses[0].item() == pytest.approx(losses[1].item(), rel=1e-12)
+    (pulled,), (expected,) = (torch.autograd.grad(loss, rgb) for loss, rgb in zip(losses, (light, exact), strict=True))
+    enough = white & (drawn > truth)
+    assert enough.any()
+    assert not pulled[enough].any()
+    torch.testing.assert_close(pulled[~enough], expected[~enough], rtol=1e-9, atol=1e-15)
+    assert (pulled[~white & (drawn > 1.0)] != 0).all()
 
 
 def half_sky() -> Tensor:

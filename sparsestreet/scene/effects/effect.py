@@ -184,6 +184,13 @@ class Effect(nn.Module, ABC):
         """The image behind the effect; ``rgb`` is that before it, ``view`` the one that was splatted."""
         return rgb
 
+    def gain(self, view: View) -> Float[Tensor, "3"] | None:
+        """Factors by which ``image`` multiplies red, green and blue in this view more than in others; None: 1.
+
+        For whoever compares colors of different images.
+        """
+        return None
+
     def slope(self, view: View) -> Float[Tensor, "h w"] | None:
         """Derivative of ``image`` with respect to ``rgb``, the same for all channels and above 0; None: 1.
 

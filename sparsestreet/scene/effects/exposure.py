@@ -125,11 +125,14 @@ class Exposure(Effect):
     def image(
         self, rgb: Float[Tensor, "h w 3"], splats: Rendering, view: View, options: RenderOptions
     ) -> Float[Tensor, "h w 3"]:
-        return rgb * self.log_gain(view).exp()
+        return rgb * self.gain(view)
+
+    def gain(self, view: View) -> Float[Tensor, "3"]:
+        return self.log_gain(view).exp()
 
     def slope(self, view: View) -> Float[Tensor, "h w"]:
         """Root mean square of the three factors: exact where channels are alike, or a change is the same in all."""
-        factor = self.log_gain(view).exp().square().mean().sqrt()
+        factor = self.gain(view).square().mean().sqrt()
         return factor.expand(view.camera.height, view.camera.width)
 
     def regularizers(self, view: View, state: SceneState) -> dict[str, Float[Tensor, ""]]:

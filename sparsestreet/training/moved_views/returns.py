@@ -2,22 +2,23 @@
 
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int
+from jaxtyping import Bool, Float, Float64, Int, UInt8
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from sparsestreet.data.images import WHITE
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.geometry.boxes import CarriedPoints, box_at, inside_box
 from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.gaussians import at_most, outside_boxes, returns_in_box_frame
-from sparsestreet.types import Camera, Frame, Sweep, Track
+from sparsestreet.types import Camera, Frame, Sweep, Track, View
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,14 +78,49 @@ ENLARGEMENT = 1.1
 _NO_RETURN = torch.iinfo(torch.int64).max
 
 
+Gain = Callable[[View], Float[Tensor, "3"]]
+"""Factors by which red, green and blue of an image are brighter than those of others."""
+
+
+@dataclass(frozen=True)
+class Colors:
+    """What images of several gains show of points."""
+
+    values: Float[Tensor, "*n 3"]
+    """RGB without the gain of the image; 1 is white at a gain of 1."""
+    cut_off: Bool[Tensor, "*n 3"]
+    """Whether a channel was recorded at white: then its value is a lower bound."""
+
+    @staticmethod
+    def of(pixels: UInt8[Tensor, "n 3"], gain: Float[Tensor, "3"]) -> "Colors":
+        """Those of pixels of an image with a gain."""
+        return Colors(pixels.float() / 255 / gain.cpu(), pixels >= WHITE)
+
+    def to(self, device: torch.device) -> "Colors":
+        return Colors(self.values.to(device, non_blocking=True), self.cut_off.to(device, non_blocking=True))
+
+    def at(self, rows: Int[Tensor, "..."]) -> "Colors":
+        """Those of some rows, in the shape of these."""
+        return Colors(self.values[rows], self.cut_off[rows])
+
+    def missing(self, others: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """How much brighter these are than the others; above a lower bound nothing is missing."""
+        more = self.values - others
+        return torch.where(self.cut_off, more.clamp(min=0), more)
+
+    def distance(self, others: "Colors") -> Float[Tensor, " n"]:
+        """Mean over the channels of what differs; neither misses anything above its lower bound."""
+        more = self.missing(others.values)
+        return torch.where(others.cut_off, more.clamp(max=0), more).abs().mean(-1)
+
+
 @dataclass(frozen=True)
 class Returns:
     """Colored lidar returns."""
 
     points: Float[Tensor, "n 3"]
     """World, or the frame of a box, meters."""
-    colors: Float[Tensor, "n 3"]
-    """RGB in [0, 1]."""
+    colors: Colors
     weights: Float[Tensor, " n"]
     """How far they are trusted, in [0, 1]."""
 
@@ -92,16 +128,19 @@ class Returns:
         return self.points.shape[0]
 
     def at(self, rows: Int[Tensor, " k"]) -> "Returns":
-        return Returns(self.points[rows], self.colors[rows], self.weights[rows])
+        return Returns(self.points[rows], self.colors.at(rows), self.weights[rows])
 
     @staticmethod
     def concatenate(parts: "Sequence[Returns]") -> "Returns":
         """The rows of all parts in order."""
         if not parts:
-            return Returns(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
+            nothing = torch.zeros(0, 3)
+            return Returns(nothing, Colors(nothing, nothing.bool()), torch.zeros(0))
         return Returns(
             torch.cat([part.points for part in parts]),
-            torch.cat([part.colors for part in parts]),
+            Colors(
+                torch.cat([part.colors.values for part in parts]), torch.cat([part.colors.cut_off for part in parts])
+            ),
             torch.cat([part.weights for part in parts]),
         )
 
@@ -112,7 +151,8 @@ class Target:
 
     depth: Float[Tensor, "h w"]
     """Along the optical axis, meters."""
-    color: Float[Tensor, "h w 3"]
+    colors: Colors
+    """One a pixel."""
     weight: Float[Tensor, "h w"]
 
 
@@ -134,7 +174,8 @@ def target(camera: Camera, street: Returns, objects: Returns, boxes: Sequence[Bo
     returns = Returns.concatenate([street, objects])
     if not len(returns):
         shape = (camera.height, camera.width)
-        return Target(torch.ones(shape), torch.zeros(*shape, 3), torch.zeros(shape))
+        nothing = torch.zeros(*shape, 3)
+        return Target(torch.ones(shape), Colors(nothing, nothing.bool()), torch.zeros(shape))
     rows, positions, depths = unhidden(camera, returns.points)
     counts = ((positions % 1 - 0.5).abs() <= reach).all(1) & (depths > NEAREST) & (depths < FARTHEST)
     rows, positions, depths = rows[counts], positions[counts], depths[counts]
@@ -150,7 +191,7 @@ def target(camera: Camera, street: Returns, objects: Returns, boxes: Sequence[Bo
     row = torch.where(found.flatten(), first & 0xFFFFFFFF, 0)
     return Target(
         torch.where(found, (first >> 32).to(torch.int32).view(torch.float32).view(found.shape), 1.0),
-        returns.colors[row].view(*found.shape, 3),
+        returns.colors.at(row.view(found.shape)),
         torch.where(found, returns.weights[row].view(found.shape), 0.0),
     )
 
@@ -199,32 +240,33 @@ def _pixels(camera: Camera, positions: Float[Tensor, "n 2"]) -> Int[Tensor, " n"
 
 
 def seen_colors(
-    points: Float[Tensor, "n 3"], frames: Sequence[Frame], places: Sequence[Float[Tensor, "n 3"]] | None = None
-) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]:
-    """RGB of each point in the first image that shows it, and which points one shows.
+    points: Float[Tensor, "n 3"], frames: Sequence[Frame], places: Sequence[Float[Tensor, "n 3"]], gain: Gain
+) -> tuple[Colors, Bool[Tensor, " n"]]:
+    """Color of each point in the first image that shows it, and which points one shows.
 
-    ``places``: where the points are in each of the images; None: in all of them where they were measured. Unlike
-    ``data.lidar.color_points`` a point behind nearer ones has no color: the lidar stands higher than the cameras and
-    looks over cars, whose color such a point would take.
+    ``places``: where the points are in each of the images. Unlike ``data.lidar.color_points`` a point behind nearer
+    ones has no color: the lidar stands higher than the cameras and looks over cars, whose color such a point would
+    take.
     """
-    colors, seen = torch.zeros_like(points), torch.zeros(len(points), dtype=torch.bool)
-    for frame, place in zip(frames, places or [points] * len(frames), strict=True):
+    colors = Colors(torch.zeros_like(points), torch.zeros_like(points, dtype=torch.bool))
+    seen = torch.zeros(len(points), dtype=torch.bool)
+    for frame, place in zip(frames, places, strict=True):
         rows, positions, _ = unhidden(frame.camera, place)
         column, line = positions.long().unbind(-1)
         if frame.ego is not None:  # the recording car hides what lies behind it
             shown = ~frame.ego[line, column]
             rows, column, line = rows[shown], column[shown], line[shown]
         new = ~seen[rows]
-        colors[rows[new]] = frame.image[line[new], column[new]].float() / 255
+        shown = Colors.of(frame.image[line[new], column[new]], gain(frame))
+        colors.values[rows[new]], colors.cut_off[rows[new]] = shown.values, shown.cut_off
         seen[rows] = True
     return colors, seen
 
 
 def agreement(
-    points: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], others: Sequence[Frame], tolerance: float
+    points: Float[Tensor, "n 3"], colors: Colors, others: Sequence[Frame], tolerance: float, gain: Gain
 ) -> Float[Tensor, " n"]:
-    """exp(-d / tolerance), d the least difference (mean over channels) to images of other instants; 1 where none shows
-    the point.
+    """exp(-d / tolerance), d the least difference to images of other instants; 1 where none shows the point.
 
     A point that stands still has its color in some other image too. One on an object that moves without a box, at an
     edge that lidar and camera see at different places, or on a mirror has not.
@@ -232,8 +274,8 @@ def agreement(
     least = torch.full((len(points),), torch.inf)
     for frame in others:
         rows, pixels, _ = visible_pixels(frame.camera, points, frame.ego)
-        difference = (frame.image.reshape(-1, 3)[pixels].float() / 255 - colors[rows]).abs().mean(1)
-        least[rows] = torch.minimum(least[rows], difference)
+        there = Colors.of(frame.image.reshape(-1, 3)[pixels], gain(frame))
+        least[rows] = torch.minimum(least[rows], colors.at(rows).distance(there))
     return torch.where(least.isinf(), 1.0, torch.exp(-least / tolerance))
 
 
@@ -287,6 +329,7 @@ def collect(
     rigid: Sequence[Track],
     settings: MovedViews,
     seed: int,
+    gain: Gain,
 ) -> StreetReturns:
     """The returns of sweeps, in the colors of the images of their instants.
 
@@ -297,6 +340,7 @@ def collect(
         rigid: those of them that keep their shape.
         settings: how many returns are kept, and how their weights fall.
         seed: of the choice of the returns that are kept.
+        gain: of each of the ``frames``.
     """
     places = _by_instant(frames)
     instants = sorted(places)
@@ -311,16 +355,16 @@ def collect(
     for sweep in sweeps:
         points = CarriedPoints(sweep.points, sweep.time, sweep.index, moving, POINT_ENLARGEMENT)
         shown = images(sweep.index)
-        colors, seen = seen_colors(sweep.points, shown, [points.at(frame.time) for frame in shown])
+        colors, seen = seen_colors(sweep.points, shown, [points.at(frame.time) for frame in shown], gain)
         still = seen & outside_boxes(moving, sweep, POINT_ENLARGEMENT)
         rows = at_most(settings.returns_per_sweep, torch.nonzero(still).squeeze(-1), generator)
         others = [frame for near in _beside(sweep.index, instants) for frame in images(near)]
-        weights = agreement(sweep.points[rows], colors[rows], others, settings.tolerance)
-        street.append(Returns(sweep.points[rows], colors[rows], weights))
+        weights = agreement(sweep.points[rows], colors.at(rows), others, settings.tolerance, gain)
+        street.append(Returns(sweep.points[rows], colors.at(rows), weights))
         starts.append(starts[-1] + len(rows))
         on = torch.nonzero(seen & _on_objects(sweep, rigid)).squeeze(-1)
         carried[sweep.index] = replace(points, points=sweep.points[on], tracks=rigid)
-        objects[sweep.index] = Returns(carried[sweep.index].points, colors[on], torch.ones(len(on)))
+        objects[sweep.index] = Returns(carried[sweep.index].points, colors.at(on), torch.ones(len(on)))
     return StreetReturns(Returns.concatenate(street), sweeps.indices, tuple(starts), objects, tuple(moving), carried)
 
 

@@ -76,13 +76,15 @@ class MovedViewTerm:
         sampled = replace(rendering.options.settings, eps2d=rendering.options.settings.eps2d / settings.divisor**2)
         seen = from_another_camera(scene, rendering, view, replace(rendering.options, settings=sampled))
         device = seen.depth.device
-        depth, color, weight = (each.to(device, non_blocking=True) for each in (found.depth, found.color, found.weight))
+        depth, weight = (each.to(device, non_blocking=True) for each in (found.depth, found.weight))
         known = (weight > 0) & (seen.depth.detach() > NEAREST)
         weight = torch.where(known, weight, 0.0) / weight.numel()
         inverse = 1 / torch.where(known, seen.depth, 1.0) - 1 / torch.where(known, depth, 1.0)
+        # Returns have the exposures of many images: they are compared without any.
+        missing = found.colors.to(device).missing(seen.rgb / scene.gain(view))
         return {
             "moved_depth": settings.depth_weight * (weight * inverse.abs()).sum(),
-            "moved_color": settings.color_weight * (weight * (seen.rgb - color).abs().mean(-1)).sum(),
+            "moved_color": settings.color_weight * (weight * missing.abs().mean(-1)).sum(),
         }
 
     def _camera(self, camera: Camera, distance: float) -> Camera:
@@ -126,9 +128,11 @@ fit have up to 0.4 and 1.0: lidars stand above cameras and look over edges."""
 
 
 def moved_view_term(
-    settings: MovedViews, data: StreetData, nodes: Mapping[str, NodeSettings], seed: int
+    settings: MovedViews, data: StreetData, scene: SceneGraph, nodes: Mapping[str, NodeSettings], seed: int
 ) -> MovedViewTerm | None:
     """The terms of a run's moved views; None where no lidar says what these show. The program's log says which.
+
+    The colors of returns lose the gains that the images have in the ``scene`` as it starts.
 
     Objects of rigid nodes are seen in moved views as the lidar saw them in the same instant. Of all other objects that
     move nothing is known there, nor of what lies behind them.
@@ -143,8 +147,8 @@ def moved_view_term(
     taken = {track.name for tracks in by_node.values() for track in tracks}
     moving = [track for track in log.tracks if track.name in taken or displacement(track) > MOVES]
     moving, rigid = without_frames(moving, held_out), without_frames(rigid, held_out)
-    with stage("points"):
-        returns = collect(sweeps, data.split.train, moving, rigid, settings, seed)
+    with stage("points"), torch.no_grad():
+        returns = collect(sweeps, data.split.train, moving, rigid, settings, seed, scene.gain)
     _log.info(
         "views beside the path: %s returns of the street, of mean weight %.2f (1: an image before or after shows the "
         "same color)",

@@ -6,14 +6,23 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.training.moved_views import MovedViews
 from sparsestreet.training.moved_views.returns import StreetReturns, collect
-from sparsestreet.types import Frame, Sweep, Track
+from sparsestreet.types import Frame, Sweep, Track, View
 from tests.training.stubs import frame_at
 
 SETTINGS = MovedViews(tolerance=0.1)
+GAIN = torch.tensor([1.25, 1.0, 0.8])
+
+
+def gain(view: View) -> Tensor:
+    """Another one for each image."""
+    return GAIN ** (1 + view.frame_index)
+
+
 HIDDEN = [0.05, 0.0, 8.0]
 """Behind the return of the car."""
 STREET, CAR, ROAD, PERSON, UNSEEN = (
@@ -44,7 +53,7 @@ def sweep(index: int) -> Sweep:
 def found() -> StreetReturns:
     frames = as_frames([frame_at(index) for index in (0, 2, 4)])
     sweeps = Sweeps.of(tuple(sweep(index) for index in (0, 2, 4)))
-    return collect(sweeps, frames, [CAR_TRACK, PERSON_TRACK], [CAR_TRACK], SETTINGS, seed=0)
+    return collect(sweeps, frames, [CAR_TRACK, PERSON_TRACK], [CAR_TRACK], SETTINGS, 0, gain)
 
 
 def test_the_street_is_what_lies_in_no_moving_box(found):
@@ -64,7 +73,7 @@ def test_colors_are_those_of_the_frames_own_image(found):
     frame = frame_at(2)
     positions = frame.camera.intrinsics @ torch.tensor(STREET)
     column, line = (positions[:2] / positions[2]).long().tolist()
-    torch.testing.assert_close(found.street.colors[1], frame.image[line, column] / 255)
+    torch.testing.assert_close(found.street.colors.values[1], frame.image[line, column] / 255 / gain(frame))
 
 
 def test_weights_are_of_the_images_before_and_after(found):
@@ -85,7 +94,8 @@ def test_an_objects_hidden_returns_have_no_color():
     points = torch.tensor([CAR, HIDDEN])
     sweeps = Sweeps.of((Sweep(0, 0.0, points, torch.zeros(2, 3), torch.ones(2, dtype=torch.bool)),))
     long = track("truck", CAR, [4.0, 4.0, 8.0])
-    assert collect(sweeps, as_frames([frame_at(0)]), [long], [long], SETTINGS, 0).objects[0].points.tolist() == [CAR]
+    found = collect(sweeps, as_frames([frame_at(0)]), [long], [long], SETTINGS, 0, gain)
+    assert found.objects[0].points.tolist() == [CAR]
 
 
 def test_images_of_the_nearest_instants_weigh():
@@ -94,7 +104,7 @@ def test_images_of_the_nearest_instants_weigh():
     point = Sweep(4, 1.0, torch.tensor([STREET]), torch.zeros(1, 3), torch.ones(1, dtype=torch.bool))
     for agreeing, weight in ((3, 1.0), (5, 1.0), (2, math.exp(-1000 / 255)), (7, math.exp(-1000 / 255))):
         frames = [replace(frame_at(0), frame_index=i, image=gray if i in (4, agreeing) else black) for i in range(2, 8)]
-        found = collect(Sweeps.of((point,)), as_frames(frames), [], [], SETTINGS, 0)
+        found = collect(Sweeps.of((point,)), as_frames(frames), [], [], SETTINGS, 0, lambda view: torch.ones(3))
         assert found.street.weights.tolist() == [pytest.approx(weight, rel=1e-5)]
 
 
@@ -112,7 +122,7 @@ def test_each_image_is_read_once_and_few_are_in_memory():
     frames = Frames(
         [replace(frame_at(0), frame_index=index) for index in range(9)], lambda view: load(view.frame_index)
     )
-    collect(Sweeps.of(tuple(sweep(index) for index in range(9))), frames, [], [], SETTINGS, 0)
+    collect(Sweeps.of(tuple(sweep(index) for index in range(9))), frames, [], [], SETTINGS, 0, gain)
     assert sorted(read) == list(range(9))
     assert max(most) <= 4  # the one that makes way goes when the next is there
 
@@ -120,7 +130,7 @@ def test_each_image_is_read_once_and_few_are_in_memory():
 def test_a_sweep_keeps_no_more_than_it_may():
     frames, sweeps = as_frames([frame_at(4)]), Sweeps.of((sweep(4),))
     settings = MovedViews(returns_per_sweep=2)
-    kept = [collect(sweeps, frames, [], [], settings, seed).street for seed in (0, 0, 1, 2, 3)]
+    kept = [collect(sweeps, frames, [], [], settings, seed, gain).street for seed in (0, 0, 1, 2, 3)]
     assert {len(street) for street in kept} == {2}
     assert torch.equal(kept[0].points, kept[1].points)
     assert any(not torch.equal(kept[0].points, street.points) for street in kept[2:])
@@ -147,14 +157,14 @@ def test_objects_are_where_they_are_when_the_image_is_taken():
     points = torch.tensor([CAR, STREET])
     sweeps = Sweeps.of((Sweep(0, 0.0, points, torch.zeros(2, 3), torch.ones(2, dtype=torch.bool)),))
     frame = replace(frame_at(0), time=0.2)
-    found = collect(sweeps, as_frames([frame]), [car], [car], SETTINGS, seed=0)
+    found = collect(sweeps, as_frames([frame]), [car], [car], SETTINGS, 0, gain)
     halfway = torch.tensor([[CAR[0] + 1.0, *CAR[1:]]])
     assert torch.equal(found.objects_at(0, 0.0).points, torch.tensor([CAR]))
     torch.testing.assert_close(found.objects_at(0, 0.2).points, halfway)
     assert not len(found.objects_at(3, 0.2))
     position = frame.camera.intrinsics @ halfway[0]
     column, line = (position[:2] / position[2]).long().tolist()
-    torch.testing.assert_close(found.objects[0].colors[0], frame.image[line, column] / 255)
+    torch.testing.assert_close(found.objects[0].colors.values[0], frame.image[line, column] / 255 / gain(frame))
     ((pose, _),) = found.boxes(0, 0.2)
     torch.testing.assert_close(pose[:3, 3], halfway[0].double())
     assert found.street.points.tolist() == [STREET]

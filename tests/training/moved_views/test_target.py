@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.training.moved_views.returns import Returns, behind_boxes, target, unhidden
+from sparsestreet.training.moved_views.returns import Colors, Returns, behind_boxes, target, unhidden
 from sparsestreet.types import Camera
 
 WIDTH, HEIGHT = 8, 6
@@ -24,7 +24,7 @@ def returns(*points: list[float], weight: float = 1.0) -> Returns:
     """Each in a color of its own."""
     count = len(points)
     colors = torch.arange(3.0 * count).view(count, 3) / (3 * count)
-    return Returns(torch.tensor(points), colors, torch.full((count,), weight))
+    return Returns(torch.tensor(points), Colors(colors, colors > 0.5), torch.full((count,), weight))
 
 
 def test_a_pixel_takes_its_nearest_return():
@@ -33,8 +33,9 @@ def test_a_pixel_takes_its_nearest_return():
     assert torch.nonzero(found.weight).tolist() == [[1, 2], [4, 6]]
     assert found.depth[1, 2] == pytest.approx(4.9)
     assert found.depth[4, 6] == pytest.approx(7.0)
-    assert torch.equal(found.color[1, 2], street.colors[1])
-    assert torch.equal(found.color[4, 6], street.colors[2])
+    for pixel, row in (((1, 2), 1), ((4, 6), 2)):
+        assert torch.equal(found.colors.values[pixel], street.colors.values[row])
+        assert torch.equal(found.colors.cut_off[pixel], street.colors.cut_off[row])
     assert set(found.weight.unique().tolist()) == {0.0, 0.5}
 
 

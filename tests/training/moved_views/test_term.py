@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch import Tensor
 
 from sparsestreet.data.lidar import EdgeShift
 from sparsestreet.scene.effects import LensSettings
+from sparsestreet.scene.effects.exposure import Exposure, ExposureSettings
 from sparsestreet.scene.effects.optics import Pinhole
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
@@ -15,7 +17,7 @@ from sparsestreet.scene.rendering import RenderOptions, SceneRendering, from_ano
 from sparsestreet.scene.state import SceneState
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
 from sparsestreet.training.moved_views import term as term_module
-from sparsestreet.training.moved_views.returns import Returns, StreetReturns, target
+from sparsestreet.training.moved_views.returns import Colors, Returns, StreetReturns, target
 from sparsestreet.training.moved_views.term import free_range, report_shift
 from sparsestreet.types import Camera, Frame, Track, View
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
@@ -27,7 +29,12 @@ def wall(depth: float) -> Returns:
     """A fine grid of returns on a plane before the camera, whose colors are its places; half of the weight."""
     x, y = torch.meshgrid(torch.linspace(-9, 9, 400), torch.linspace(-6, 6, 300), indexing="ij")
     points = torch.stack((x.flatten(), y.flatten(), torch.full((x.numel(),), depth)), 1)
-    return Returns(points, (points / 20 + 0.5).clamp(0, 1), torch.full((len(points),), 0.5))
+    return Returns(points, whole((points / 20 + 0.5).clamp(0, 1)), torch.full((len(points),), 0.5))
+
+
+def whole(colors: Tensor) -> Colors:
+    """Of which none is cut off."""
+    return Colors(colors, torch.zeros_like(colors, dtype=torch.bool))
 
 
 def street(returns: Returns) -> StreetReturns:
@@ -122,8 +129,8 @@ def test_what_a_view_is_compared_with(monkeypatch):
     """Returns of the sweeps around its frame, near its field of view; objects and boxes of its own instant."""
     behind, ahead, right = [0.0, 0.0, -9.0], [0.0, 0.0, 9.0], [9.5, 0.0, 6.0]  # the last 2.5 m outside the image
     points = torch.tensor([ahead, behind, ahead, right, ahead])
-    both = Returns(points, torch.zeros(5, 3), torch.arange(5.0) / 5)
-    car = Returns(torch.ones(1, 3), torch.ones(1, 3), torch.ones(1))
+    both = Returns(points, whole(torch.zeros(5, 3)), torch.arange(5.0) / 5)
+    car = Returns(torch.ones(1, 3), whole(torch.ones(1, 3)), torch.ones(1))
     poses = torch.eye(4, dtype=torch.float64)[None].repeat(2, 1, 1)
     poses[1, 0, 3] = 2.0
     times = torch.tensor([0.3, 0.7], dtype=torch.float64)
@@ -151,7 +158,7 @@ def test_what_a_view_is_compared_with(monkeypatch):
 def test_cameras_of_a_frame_see_their_own_returns(monkeypatch):
     """The second camera of a frame looks backwards: what is near it is not what is near the first."""
     points = torch.tensor([[0.0, 0.0, 9.0], [0.0, 0.0, -9.0], [0.5, 0.0, -8.0]])
-    returns = StreetReturns(Returns(points, torch.zeros(3, 3), torch.ones(3)), (0,), (0, 3), {}, ())
+    returns = StreetReturns(Returns(points, whole(torch.zeros(3, 3)), torch.ones(3)), (0,), (0, 3), {}, ())
     asked = []
     monkeypatch.setattr(term_module, "target", lambda *given: asked.append(given[1]) or target(*given))
     one, front = scene(), frame_at(0, WIDTH, HEIGHT)
@@ -175,6 +182,20 @@ def test_floaters_before_the_camera_are_left_to_the_recorded_views():
     blocked = term(one, replace(rendering, gaussians=floaters), frame)["moved_depth"].item()
     assert usual > 0
     assert blocked < usual / 10
+
+
+def test_gains_of_images_are_no_matter_of_moved_views():
+    """Returns have lost them: a brighter image is compared with the same colors, and gains learn nothing there."""
+    plain, frame = scene(), frame_at(0, WIDTH, HEIGHT)
+    exposure = Exposure(ExposureSettings(), {0: [0.0, 1.0]})
+    exposure.start_from([frame], torch.tensor([[0.4, -0.1, 0.2]]))
+    bright = SceneGraph(dict(plain.nodes.items()), {"exposure": exposure})
+    term = MovedViewTerm(MovedViews(), street(wall(4.0)), seed=7)
+    colors = [term(one, seen(one, frame), frame)["moved_color"] for one in (plain, bright)]
+    assert not torch.equal(seen(plain, frame).rgb, seen(bright, frame).rgb)
+    torch.testing.assert_close(colors[1], colors[0], rtol=1e-6, atol=0.0)  # of one rounding more
+    (gradient,) = torch.autograd.grad(colors[1], [exposure.log_gains])
+    assert gradient.abs().max() < 1e-7 * colors[1]  # two terms that cancel to rounding
 
 
 def test_which_steps_have_a_moved_view():
