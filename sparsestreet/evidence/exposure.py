@@ -2,7 +2,7 @@
 
 import statistics
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 
@@ -40,6 +40,14 @@ LOW = 0.8
 """Meters below a camera from which on a point belongs to the road, whose shine changes as one drives towards it."""
 MIN_SHARED = 40
 """Points that two images share; fewer do not link them."""
+OUTLIER = 0.3
+"""Log ratio beside the median of its pair of images from which a point says nothing of shine."""
+SHINE_STEP = 4
+"""Of so many images one is asked about shine."""
+MIN_SPREAD = 1.0
+"""Squared log ratios of distances, summed over points, beside which shine is not measured: a tenth, of 100 points."""
+JUMP, DRIFT = 0.07, 0.01
+"""Log gains: a tenth of an EV, which cameras jump by, and what shine leaves of an error from instant to instant."""
 FLOOR = 0.003
 """Standard error of a link that no number of points goes below: surfaces shine, and gray levels are rounded."""
 
@@ -144,6 +152,25 @@ def solved(links: Links, images: int) -> Float64[Tensor, "n 3"]:
     return gains - gains.mean(0)
 
 
+def without_drift(gains: ImageGains) -> Float64[Tensor, "n 3"]:
+    """The log gains less the slow part that the images of all cameras share.
+
+    A drift is the sum of many links, and so is what is left of shine: nothing tells the two apart. Of the mean m over
+    the cameras at each instant, drift is the d with the least::
+
+        sum_t (m_t - d_t)^2 / JUMP^2 + (d_t+1 - d_t)^2 / DRIFT^2
+    """
+    instants = torch.tensor([view.indices[0] for view in gains.views]).unique(return_inverse=True)[1]
+    count = int(instants.max()) + 1
+    images = torch.bincount(instants, minlength=count).double()[:, None]
+    mean = torch.zeros(count, 3, dtype=torch.float64).index_add(0, instants, gains.log_gains) / images
+    steps = torch.eye(count, dtype=torch.float64).diff(dim=0)
+    system = torch.eye(count, dtype=torch.float64) + (JUMP / DRIFT) ** 2 * steps.T @ steps
+    drift = torch.linalg.solve(system, mean)
+    found = gains.log_gains - drift[instants]
+    return found - found.mean(0)
+
+
 def _least_squares(first: Tensor, second: Tensor, ratios: Tensor, weights: Tensor, images: int) -> Tensor:
     normal = torch.zeros(images, images, dtype=torch.float64)
     for a, b, sign in ((first, first, 1), (second, second, 1), (first, second, -1), (second, first, -1)):
@@ -216,6 +243,7 @@ class _Levels:
         self._numbers: list[Int[Tensor, " _"]] = []
         self._logs: list[Float[Tensor, "_ 3"]] = []
         self._low: list[Bool[Tensor, " _"]] = []
+        self._distances: list[Float[Tensor, " _"]] = []
         self._squares = 0.0
         self._points = points
 
@@ -240,15 +268,52 @@ class _Levels:
         self._ranks.append(rank)
         self._numbers.append(numbers[rows[kept]])
         self._logs.append(level[line[kept], column[kept]].log())
-        down = transform_points(frame.camera.camera_from_world.to(points), points[rows[kept]])[:, 1]
-        self._low.append(down > LOW)
+        places = transform_points(frame.camera.camera_from_world.to(points), points[rows[kept]])
+        self._low.append(places[:, 1] > LOW)
+        self._distances.append(places.norm(dim=1).log())
         self._squares += float((frame.image.float() / 255).square().mean())
 
     def links(self) -> tuple[Links, Links, Links]:
         """All pairs of images that share enough points; those by low points alone, and by the others alone."""
         found = _Pairs(), _Pairs(), _Pairs()
+        shines = self._shines()
+        for first, second, ratio, nearing, low in self._shared(range(len(self.views))):
+            shine = torch.where(low[:, None] == 1, shines[1], shines[0])
+            ratio = ratio - nearing[:, None] * shine
+            for pairs, of in zip(found, (slice(None), low == 1, low == 0), strict=True):
+                pairs.add(first, second, ratio[of])
+        everything, below, above = (pairs.links() for pairs in found)
+        return everything, below, above
+
+    def _shines(self) -> Float[Tensor, "2 3"]:
+        """By how much levels of other and of low points change with the logarithm of their distance.
+
+        A gain changes all points of an image alike. A road in front of a low sun gets darker as one comes nearer, the
+        near part of it more than the far one: what points of one pair of images show of it beside each other is no
+        gain, and neither is what all of them have of it.
+        """
+        products, squares = torch.zeros(2, 3), torch.full((2, 1), MIN_SPREAD)
+        for _, _, ratio, nearing, low in self._shared(range(0, len(self.views), SHINE_STEP)):
+            for kind in (0, 1):
+                own = low == kind
+                if int(own.sum()) >= MIN_SHARED:
+                    change = ratio[own] - ratio[own].median(0).values
+                    apart = (nearing[own] - nearing[own].median())[:, None]
+                    products[kind] += torch.where(change.abs() < OUTLIER, apart * change, 0.0).sum(0)
+                    squares[kind] += apart.square().sum()
+        return products / squares
+
+    def _shared(
+        self, images: range
+    ) -> Iterator[tuple[int, int, Float[Tensor, "p 3"], Float[Tensor, " p"], Int[Tensor, " p"]]]:
+        """Of some images with all that come after them and share enough points: log ratios of levels and of distances,
+        and the kind of points.
+
+        Kinds: 0 other, 1 low, 2 low in one of the images alone.
+        """
         place = torch.empty(self._points, dtype=torch.int64)
-        for first, numbers in enumerate(self._numbers):
+        for first in images:
+            numbers = self._numbers[first]
             place.fill_(-1)
             place[numbers] = torch.arange(len(numbers))
             for second in range(first + 1, len(self.views)):
@@ -258,12 +323,11 @@ class _Levels:
                 both = at >= 0
                 if int(both.sum()) < MIN_SHARED:
                     continue
-                ratio = self._logs[second][both] - self._logs[first][at[both]]
-                low, before = self._low[second][both], self._low[first][at[both]]
-                for pairs, of in zip(found, (slice(None), low & before, ~low & ~before), strict=True):
-                    pairs.add(first, second, ratio[of])
-        everything, below, above = (pairs.links() for pairs in found)
-        return everything, below, above
+                at = at[both]
+                ratio = self._logs[second][both] - self._logs[first][at]
+                nearing = self._distances[second][both] - self._distances[first][at]
+                low, before = self._low[second][both], self._low[first][at]
+                yield first, second, ratio, nearing, torch.where(low == before, low.long(), 2)
 
 
 class _Pairs:

@@ -16,6 +16,7 @@ from sparsestreet.evidence.exposure import (
     gain_errors,
     image_gains,
     solved,
+    without_drift,
 )
 from sparsestreet.types import Camera, Track, View
 from tests.evidence import wall
@@ -74,15 +75,16 @@ def flickering(frames, **changes):
     return made
 
 
-def left() -> torch.Tensor:
+def left(share: float = 0.7) -> torch.Tensor:
     mask = torch.zeros(wall.HEIGHT, wall.WIDTH, dtype=torch.bool)
-    mask[:, : int(0.7 * wall.WIDTH)] = True
+    mask[:, : int(share * wall.WIDTH)] = True
     return mask
 
 
 @pytest.mark.parametrize("mask", ["ego", "vehicle", "human", "sky"])
 def test_masked_pixels_are_left_out(frames, mask: str):
-    assert_planted(gains_of(flickering(frames, **{mask: left()})))
+    # The rest nears the camera: what rounding makes of shine (0.005) adds up along the drive.
+    assert_planted(gains_of(flickering(frames, **{mask: left()})), tolerance=4 * TOLERANCE)
 
 
 def test_flicker_without_a_mask_would_be_taken_for_a_gain(frames):
@@ -189,6 +191,38 @@ def test_of_many_images_runs_of_neighbors_are_looked_at():
     assert indices == [*range(24), *range(76, 100)]
     # Instants around the others were not looked at, but nothing was recorded before the first or behind the last.
     assert [index for index, inner in zip(indices, found.inner, strict=True) if inner] == [*range(16), *range(84, 100)]
+
+
+def test_levels_that_change_with_the_distance_are_no_gain(frames):
+    """Every point gets darker by the square root of its distance: for the nearest ones a third over the drive."""
+
+    def shining(frame):
+        x, y = ((torch.arange(size) + 0.5 - size / 2) / wall.FOCAL for size in (wall.WIDTH, wall.HEIGHT))
+        distances = (1 + x[None] ** 2 + y[:, None] ** 2).sqrt()
+        image = frame.image.float() * distances[..., None] ** 0.5
+        return replace(frame, image=image.round().clamp(0, 255).to(torch.uint8))
+
+    # What is left of the image nears the camera; without a look at shine the gains are 0.05 off.
+    right = [replace(shining(frame), ego=left(0.4)) for frame in frames]
+    assert_planted(gains_of(right), tolerance=4 * TOLERANCE)
+
+
+def test_a_drift_that_all_cameras_share_is_left_out():
+    """Not what jumps, nor what one camera has for itself: two cameras of other colors, a ramp, and jumps in time."""
+    count, generator = 80, torch.Generator().manual_seed(3)
+    tints = torch.tensor([[0.1, 0.0, -0.1], [-0.1, 0.0, 0.1]], dtype=torch.float64)
+    jumps = 0.1 * (-1.0) ** torch.arange(count, dtype=torch.float64)[:, None, None]
+    ramp = torch.linspace(-0.6, 0.6, count, dtype=torch.float64)[:, None, None]
+    measured = gains((ramp + jumps + tints) / EV)
+    order = torch.randperm(2 * count, generator=generator)
+    mixed = replace(measured, views=tuple(measured.views[i] for i in order), log_gains=measured.log_gains[order])
+    found = torch.empty_like(measured.log_gains)
+    found[order] = without_drift(mixed)
+    found = found.view(count, 2, 3)
+    inner = slice(25, -25)  # at its ends the drive has neighbors on one side only
+    # Of a jump that alternates 1 / (1 + 4 x 49) is taken for drift, and a part of the ramp at 25 from the ends.
+    torch.testing.assert_close(found[inner], (jumps + tints)[inner].expand(-1, 2, 3), rtol=0, atol=0.004)
+    assert float(found[:, 0].sub(tints[0]).abs().max()) < 0.3  # of 0.7
 
 
 def test_a_wrong_link_moves_no_gain():

@@ -12,7 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from sparsestreet.evidence.exposure import EV, MIN_INSTANTS, GainErrors, ImageGains, gain_errors, image_gains
+from sparsestreet.evidence.exposure import (
+    EV,
+    MIN_INSTANTS,
+    GainErrors,
+    ImageGains,
+    gain_errors,
+    image_gains,
+    without_drift,
+)
 from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.pictures.images import Dots
 from sparsestreet.scene.effects.effect import Cost, Effect, EffectSettings, Finding, neighbors_in_time
@@ -73,11 +81,11 @@ class ExposureSettings(EffectSettings):
         return Cost(numbers=3 * len(data.views), ns_per_pixel=3.3)
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Exposure":
-        """Start from the gains that are measured on all images; from none where nothing can be measured."""
+        """Start from the gains that are measured on all images, without drift; from none where nothing is measured."""
         made = Exposure(self, _times(data.views))
         gains = _measured(data, most=None)
         if gains is not None:
-            made.start_from(gains.views, gains.log_gains)
+            made.start_from(gains.views, without_drift(gains))
         return made
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Exposure":

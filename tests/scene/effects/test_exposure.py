@@ -168,6 +168,7 @@ def test_boxes_of_held_out_frames_say_nothing():
 
 def test_it_starts_from_the_measured_gains_of_training_images_alone():
     planted = wall.random_gains(0.1)
+    planted = planted - planted.mean(1, keepdim=True)  # what both cameras share may be drift
     held_out = frozenset({3, 8})
     data = training_data(log_of(planted), held_out)
     made = SETTINGS.build(data, SETTINGS.detect(data), torch.Generator())
