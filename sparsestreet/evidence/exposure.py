@@ -46,7 +46,7 @@ SHINE_STEP = 4
 """Of so many images one is asked about shine."""
 MIN_SPREAD = 1.0
 """Squared log ratios of distances, summed over points, beside which shine is not measured: a tenth, of 100 points."""
-JUMP, DRIFT = 0.07, 0.01
+JUMP, DRIFT = 0.07, 0.005
 """Log gains: a tenth of an EV, which cameras jump by, and what shine leaves of an error from instant to instant."""
 FLOOR = 0.003
 """Standard error of a link that no number of points goes below: surfaces shine, and gray levels are rounded."""

@@ -19,8 +19,8 @@ class EffectDecision:
     name: str
     on: bool
     source: str
-    """Who decided: "declared" by the log's files, "measured" on its images, points or boxes, "forced" by the
-    configuration."""
+    """Who decided: "declared" by the log's files, "measured" on its images, points or boxes, "probed" by two short
+    trainings, "forced" by the configuration."""
     reason: str
     """One sentence, without a full stop."""
     value: float | None

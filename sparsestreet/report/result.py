@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
+from sparsestreet.records.costs import COSTS
 from sparsestreet.records.curves import HELD_OUT_CURVE
 from sparsestreet.records.run import RunDescription
 from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
@@ -30,6 +31,7 @@ def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDI
     return [
         *(_quality(summary, split, protocol) for split in (HELD_OUT, TRAINING) if split in summary.quality),
         ", ".join([*size, f"{latency.p50:.1f} ms a frame{steady}"]),
+        *_effects(run, out),
         *_warnings(run),
         *_better_before(out),
         f"pictures: {out / 'pictures' / 'sheet.png'}; curves: {out / 'curves'}; numbers: {out / 'records'}",
@@ -42,6 +44,23 @@ def _warnings(run: RunDescription) -> list[str]:
         (run.rested, "rows that took no step because their gradient was not finite, counted at each step"),
     )
     return [f"{what}: {', '.join(f'{name} {n:,}' for name, n in counts.items())}" for counts, what in said if counts]
+
+
+def _effects(run: RunDescription, out: Path) -> list[str]:
+    """What each effect brings beside what was foreseen, and those that cost more than they bring."""
+    costs = COSTS.find(out)
+    gains = {} if costs is None else costs.gains
+    said = []
+    for effect in (one for one in run.effects if one.on and one.name in gains):
+        gain = gains[effect.name]
+        if gain.full < 0:
+            said.append(
+                f"effects.{effect.name} costs more than it brings: {gain.full:+.2f} dB in {gain.images} images; "
+                f"effects.{effect.name}=off trains without it"
+            )
+        elif effect.gain is not None:
+            said.append(f"effects.{effect.name} brings {gain.full:.2f} dB (foreseen: {effect.gain:.2f})")
+    return said
 
 
 def _better_before(out: Path) -> list[str]:

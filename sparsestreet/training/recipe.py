@@ -19,6 +19,7 @@ from sparsestreet.training.callbacks import DensityControl, MaskTraining, Prunin
 from sparsestreet.training.losses import Loss, MaskSparsity, Photometric
 from sparsestreet.training.moved_views import MovedViews, moved_view_term
 from sparsestreet.training.optimizer import OptimizerSettings
+from sparsestreet.training.probe import Probe
 from sparsestreet.training.schedule import ResolutionSchedule
 from sparsestreet.training.system import StreetSystem
 from sparsestreet.triangulation import ImagePointSettings
@@ -95,11 +96,26 @@ class Recipe:
             raise ValueError("; ".join(found))
 
     def plan(self, data: StreetData) -> EffectPlan:
-        """Which effects the training part of the data calls for.
+        """Which effects the training part of the data calls for; where a measure alone does not say it, by a probe.
 
         Raises ValueError for an effect that is forced on and that the log cannot support.
         """
-        return plan_effects(self.effects, _training_data(data))
+        plan, log, split = plan_effects(self.effects, _training_data(data)), data.driving_log, data.split
+        for name in (planned.name for planned in plan.effects if planned.asks_for_probe):
+            probe = Probe(
+                log,
+                split.train,
+                split.held_out_indices,
+                self.nodes,
+                self.losses,
+                self.optimizer,
+                self.options,
+                self.seed,
+            )
+            gain = probe.gain(plan, name)
+            if gain is not None:
+                plan = plan.switched(name, gain.is_certain, gain)
+        return plan
 
     def decisions(self, plan: EffectPlan, data: StreetData) -> tuple[EffectDecision, ...]:
         """The plan as records have it, with costs in a scene of as many Gaussians as the nodes' limits allow."""

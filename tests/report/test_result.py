@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from sparsestreet.records.costs import EffectGain, update_costs
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.run import EffectDecision
 from sparsestreet.records.summary import HELD_OUT, MetricSummary
 from sparsestreet.report.result import result_lines
 from tests.evaluation.frames import disturbed, make_summary
@@ -44,6 +46,23 @@ def test_what_held_out_views_have_lost_is_said(tmp_path):
     assert "PSNR 33.00 dB at step 1, 32.40 dB at the end" in result_lines(make_summary("plain", 0, 24.35), tmp_path)[-2]
     HELD_OUT_CURVE.write(tmp_path, [HeldOutLook(9.0, 1, 32.8, None, None), HeldOutLook(9.0, 2, 32.4, None, None)])
     assert not any("better before" in line for line in result_lines(make_summary("plain", 0, 24.35), tmp_path))
+
+
+def test_what_effects_bring_is_said_beside_what_was_foreseen(tmp_path):
+    def decided(name: str, on: bool, gain: float | None) -> EffectDecision:
+        said = {"source": "measured", "reason": "seen", "unit": "EV", "numbers": 3, "ms": 0.1, "gain": gain}
+        return EffectDecision(name=name, on=on, value=1.0, threshold=0.5, noise=0.1, **said)
+
+    effects = decided("sky", True, None), decided("exposure", True, 0.4), decided("lens", True, None)
+    summary = make_summary("plain", 0, 24.35)
+    run = dataclasses.replace(summary.run, effects=(*effects, decided("affine", False, 0.2)))
+    summary = dataclasses.replace(summary, run=run)
+    assert len(result_lines(summary, tmp_path)) == 3  # nothing was measured
+    gains = {"sky": 1.0, "exposure": 0.31, "lens": -0.07}
+    update_costs(tmp_path, gains={name: EffectGain(gain, None, None, 6) for name, gain in gains.items()})
+    brings, costs = result_lines(summary, tmp_path)[-3:-1]
+    assert brings == "effects.exposure brings 0.31 dB (foreseen: 0.40)"
+    assert costs == ("effects.lens costs more than it brings: -0.07 dB in 6 images; effects.lens=off trains without it")
 
 
 def test_seconds_of_a_busy_machine_say_so():

@@ -14,6 +14,7 @@ from sparsestreet.scene.effects.effect import (
     Finding,
     LinearizedEffects,
     Moment,
+    ProbedGain,
     linearized,
     plan_effects,
 )
@@ -52,6 +53,7 @@ __all__ = [
     "Moment",
     "MotionBlur",
     "MotionBlurSettings",
+    "ProbedGain",
     "RollingShutter",
     "ShutterSettings",
     "Sky",

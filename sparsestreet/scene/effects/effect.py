@@ -7,7 +7,7 @@ log calls for, by name; one that it does not have is not built and costs nothing
 from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -46,6 +46,28 @@ class Finding:
     """Predicted gain in PSNR over the images, dB; None: there is no prediction."""
     evidence: Callable[[], Sequence[Panel]] = tuple
     """Makes the pictures by which a person judges the value; asked only if they are drawn."""
+
+    def is_near(self) -> bool:
+        """Whether the value alone does not decide: it may be the threshold, or is less than twice as large."""
+        if self.value is None or self.threshold is None or self.noise is None or self.missing is not None:
+            return False
+        return self.threshold - 2 * self.noise <= self.value < 2 * self.threshold
+
+
+@dataclass(frozen=True)
+class ProbedGain:
+    """What a short training with an effect is better by than one without it, in views that neither saw."""
+
+    mean: float
+    """dB."""
+    error: float
+    """Standard error of the mean, from the differences between images."""
+    images: int
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is above 0 by more than its error."""
+        return self.mean > self.error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +119,8 @@ class EffectSettings(ABC):
     """auto: the scene has the effect if its log calls for it; on: in any case; off: never, whatever the log says."""
     found_when_off: ClassVar[bool] = False
     """Whether the plan says what the log shows also where the effect is off: for those that are off by default."""
+    probed: ClassVar[bool] = False
+    """Whether two short trainings decide where the value is near the threshold (``training.probe``)."""
     learning_rates: Rates = field(default_factory=dict)
     """Parameter or module of the effect -> its rate, or the fields of one; the longest name that matches wins."""
 
@@ -269,17 +293,32 @@ class PlannedEffect:
     settings: EffectSettings
     finding: Finding
     on: bool
+    probe: ProbedGain | None = None
+    """What decided, where the finding alone did not."""
+
+    @property
+    def asks_for_probe(self) -> bool:
+        """Whether two short trainings should decide."""
+        return self.settings.probed and self.settings.when == "auto" and self.finding.is_near()
 
     @property
     def only_found(self) -> bool:
         """Whether the log calls for it, and something is missing for a scene to have it."""
-        return self.finding.called_for and not self.on
+        return self.finding.called_for and not self.on and self.probe is None
 
     def _reason(self) -> str:
+        if self.probe is not None:
+            gain = f"{self.probe.mean:+.2f} ± {self.probe.error:.2f} dB in {self.probe.images} images"
+            return f"{self.finding.reason}; near the threshold two short trainings decide: {gain} with the effect"
         if not self.only_found:
             return self.finding.reason
         switched = f" (effects.{self.name}=auto simulates it)" if self.settings.when == "off" else ""
         return f"found, not simulated{switched}: {self.finding.reason}"
+
+    def _source(self) -> str:
+        if self.settings.when != "auto":
+            return "forced"
+        return "probed" if self.probe is not None else "declared" if self.finding.declared else "measured"
 
     def decision(self, data: TrainingData, rows: int) -> EffectDecision:
         """The effect as records have it, for a scene of ``rows`` Gaussians."""
@@ -287,7 +326,7 @@ class PlannedEffect:
         return EffectDecision(
             name=self.name,
             on=self.on,
-            source="forced" if self.settings.when != "auto" else "declared" if finding.declared else "measured",
+            source=self._source(),
             reason=self._reason(),
             value=finding.value,
             unit=finding.unit,
@@ -304,6 +343,11 @@ class EffectPlan:
     """All effects that a configuration knows, in the order in which they act on an image."""
 
     effects: tuple[PlannedEffect, ...]
+
+    def switched(self, name: str, on: bool, probe: ProbedGain | None = None) -> "EffectPlan":
+        """The plan with one effect on or off, and what decided it."""
+        changed = (replace(one, on=on, probe=probe) if one.name == name else one for one in self.effects)
+        return EffectPlan(tuple(changed))
 
     def decisions(self, data: TrainingData, rows: int) -> tuple[EffectDecision, ...]:
         """What ``run.json`` holds, for a scene of ``rows`` Gaussians."""

@@ -54,6 +54,7 @@ class ExposureSettings(EffectSettings):
     """Weight of the squared mean log gain over all images, by channel: twice the gains with half the light are the same
     images."""
     learning_rates: Rates = field(default_factory=lambda: {"log_gains": LearningRate(1e-3, 1e-4)})
+    probed: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -184,7 +185,7 @@ def _reason(errors: GainErrors, threshold: float) -> str:
         return f"{size}, {errors.foretold:.3f} beside the neighbors in time"
     if errors.without >= threshold:
         return f"{size}, but neighbors in time foretell too little: {errors.foretold:.3f} EV would remain"
-    return f"{size}, which is too little to matter"
+    return f"{size}, less than the threshold"
 
 
 def _shown(gains: ImageGains, errors: GainErrors) -> list[Dots]:

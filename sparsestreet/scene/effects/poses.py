@@ -4,7 +4,7 @@ import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float, Float64
@@ -156,6 +156,7 @@ class CameraPosesSettings(EffectSettings):
         default_factory=lambda: {"translations": LearningRate(0.15, 0.0015), "rotations": LearningRate(0.15, 0.0015)}
     )
     """In units of the measured error: where poses are right, hardly anything is learned."""
+    probed: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -369,6 +370,7 @@ class BoxPosesSettings(PartlessSettings):
 
     smooth: bool = True
     """Corrections start where boxes would lie on smooth paths (``geometry.trajectories``); false: at zero."""
+    probed: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -110,7 +110,7 @@ def tinted(size: float) -> torch.Tensor:
 def test_cameras_of_other_colors_call_for_gains():
     """Half of the points' images are those of the other camera, so half of the difference is the error."""
     wanted = 0.1 / math.log(2)
-    for size, on in ((0.0, False), (0.02, False), (0.1, True)):
+    for size, on in ((0.02, False), (0.1, True)):
         found = SETTINGS.detect(training_data(log_of(tinted(size))))
         assert found.called_for is on
         assert found.value is not None
