@@ -1,4 +1,4 @@
-"""Measure how dark, noisy and clipped the images are: night, flare or a wrong exposure, which no scene simulates."""
+"""Measure how dark, noisy and clipped the images are: night, flare or a wrong exposure."""
 
 import math
 from collections.abc import Iterator
@@ -56,7 +56,7 @@ class Light:
 
 
 def light_warnings(light: Light) -> Iterator[str]:
-    """Yield one sentence for each thing about the light that no scene simulates."""
+    """Yield one sentence for each thing about the light that no scene simulates in full."""
     if light.stops >= MIN_STOPS:
         yield (
             f"{light.images} images have a mean gray level of {light.level:.0f} of 255, and a noise of "
@@ -65,8 +65,8 @@ def light_warnings(light: Light) -> Iterator[str]:
     if light.clipped >= MIN_CLIPPED:
         yield (
             f"{100 * light.clipped:.1f} % of the street's pixels are clipped at white in {light.images} images, most "
-            f"in frame {light.worst_frame} ({100 * light.worst:.1f} %), as where the sun shines into the lens: nothing "
-            "simulates it"
+            f"in frame {light.worst_frame} ({100 * light.worst:.1f} %), as where the sun shines into the lens: there "
+            "training only asks for at least as much light"
         )
 
 

@@ -1,6 +1,7 @@
 """Two short trainings that decide about an effect: on a wall whose images have gains, or have none."""
 
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -24,7 +25,7 @@ def wave(size: float) -> torch.Tensor:
     return size * torch.stack((phases.sin(), -phases.sin()), 1)[..., None].expand(-1, -1, 3)
 
 
-def recipe(when: str = "auto") -> Recipe:
+def recipe(when: Literal["auto", "on", "off"] = "auto") -> Recipe:
     effects = {"exposure": ExposureSettings(when=when, threshold=0.1)}
     return Recipe(NODES, effects, losses={"photometric": Photometric()}, seed=3)
 
