@@ -153,7 +153,7 @@ def solved(links: Links, images: int) -> Float64[Tensor, "n 3"]:
 
 
 def without_drift(gains: ImageGains) -> Float64[Tensor, "n 3"]:
-    """The log gains less the slow part that the images of all cameras share.
+    """Return the log gains less the slow part that the images of all cameras share.
 
     A drift is the sum of many links, and so is what is left of shine: nothing tells the two apart. Of the mean m over
     the cameras at each instant, drift is the d with the least::

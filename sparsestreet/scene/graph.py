@@ -81,7 +81,7 @@ class SceneGraph(nn.Module):
         return next((one for one in found if one is not None), None)
 
     def gain(self, view: View) -> Float[Tensor, "3"]:
-        """Factors by which the camera makes red, green and blue of this view brighter than of others."""
+        """Return factors by which the camera makes red, green and blue of this view brighter than of others."""
         factors = torch.ones(3, device=self.device)
         for effect in self.effects.values():
             own = effect.gain(view)

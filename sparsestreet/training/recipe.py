@@ -96,7 +96,7 @@ class Recipe:
             raise ValueError("; ".join(found))
 
     def plan(self, data: StreetData) -> EffectPlan:
-        """Which effects the training part of the data calls for; where a measure alone does not say it, by a probe.
+        """Say which effects the training part of the data calls for; where a measure alone does not, a probe does.
 
         Raises ValueError for an effect that is forced on and that the log cannot support.
         """

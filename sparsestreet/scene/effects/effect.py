@@ -209,7 +209,7 @@ class Effect(nn.Module, ABC):
         return rgb
 
     def gain(self, view: View) -> Float[Tensor, "3"] | None:
-        """Factors by which ``image`` multiplies red, green and blue in this view more than in others; None: 1.
+        """Return factors by which ``image`` multiplies red, green and blue in this view more than in others; None: 1.
 
         For whoever compares colors of different images.
         """
@@ -345,7 +345,7 @@ class EffectPlan:
     effects: tuple[PlannedEffect, ...]
 
     def switched(self, name: str, on: bool, probe: ProbedGain | None = None) -> "EffectPlan":
-        """The plan with one effect on or off, and what decided it."""
+        """Return the plan with one effect on or off, and what decided it."""
         changed = (replace(one, on=on, probe=probe) if one.name == name else one for one in self.effects)
         return EffectPlan(tuple(changed))
 

@@ -93,23 +93,23 @@ class Colors:
 
     @staticmethod
     def of(pixels: UInt8[Tensor, "n 3"], gain: Float[Tensor, "3"]) -> "Colors":
-        """Those of pixels of an image with a gain."""
+        """Make those of pixels of an image with a gain."""
         return Colors(pixels.float() / 255 / gain.cpu(), pixels >= WHITE)
 
     def to(self, device: torch.device) -> "Colors":
         return Colors(self.values.to(device, non_blocking=True), self.cut_off.to(device, non_blocking=True))
 
     def at(self, rows: Int[Tensor, "..."]) -> "Colors":
-        """Those of some rows, in the shape of these."""
+        """Return those of some rows, in the shape of these."""
         return Colors(self.values[rows], self.cut_off[rows])
 
     def missing(self, others: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """How much brighter these are than the others; above a lower bound nothing is missing."""
+        """Return how much brighter these are than the others; above a lower bound nothing is missing."""
         more = self.values - others
         return torch.where(self.cut_off, more.clamp(min=0), more)
 
     def distance(self, others: "Colors") -> Float[Tensor, " n"]:
-        """Mean over the channels of what differs; neither misses anything above its lower bound."""
+        """Return the mean difference of channels; neither misses anything above its lower bound."""
         more = self.missing(others.values)
         return torch.where(others.cut_off, more.clamp(max=0), more).abs().mean(-1)
 
