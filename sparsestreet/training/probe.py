@@ -71,7 +71,7 @@ class Probe:
         return frozenset(instants[EVERY // 2 : -1 : EVERY])
 
     def _psnr(self, plan: EffectPlan) -> Float[Tensor, " n"]:
-        """Of each held-out image, after training the scene of a plan."""
+        """Train the scene of a plan; return the quality of each held-out image."""
         own = self._own_held_out
         seen, unseen = (
             [self._small(frame) for frame in self.frames.where(lambda view, out=out: (view.indices[0] in own) is out)]
