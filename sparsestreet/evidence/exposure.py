@@ -306,8 +306,8 @@ class _Levels:
     def _shared(
         self, images: range
     ) -> Iterator[tuple[int, int, Float[Tensor, "p 3"], Float[Tensor, " p"], Int[Tensor, " p"]]]:
-        """Yield of some images with all that come after them and share enough points: log ratios of levels and distances,
-        and the kind of points.
+        """Yield what some images share with all that come after them: log ratios of levels and distances of points, and
+        their kind.
 
         Kinds: 0 other, 1 low, 2 low in one of the images alone.
         """
