@@ -169,7 +169,7 @@ class RunIdentity:
             noise=None,
             caps={},
             effects=effects,
-            light=measured_light(data.split.train).numbers(),
+            light=measured_light(data.split.train, data.driving_log.kept).numbers(),
             machine=this_machine(),
             source=this_source(),
         )

@@ -107,7 +107,7 @@ CACHES = {"half a cache": cut, "an empty cache": empty, "flipped bits in a cache
 def finished(tiny_street, tmp_path_factory) -> tuple[list[str], Path]:
     """Words of a run, and its folder."""
     folder = tmp_path_factory.mktemp("damaged")
-    words = ["train", *tiny_street, *SHORT, f"image_points.cache={folder / 'points'}"]
+    words = ["train", *tiny_street, *SHORT, f"cache={folder / 'kept'}"]
     ended = command([*words, f"out={folder / 'run'}"], folder / "log")
     assert ended.status == 0, ended.said
     (folder / "run/edits.yaml").write_text("move:\n  car_1: {right: 3.0, during: [1.0, 3.0]}\n")

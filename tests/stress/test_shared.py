@@ -19,7 +19,7 @@ RUNS = 8
 
 def words(folder: Path, out: Path) -> list[str]:
     """Of one run; the street is not there yet."""
-    return ["train", *street_at(folder / "street"), *SHORT, f"image_points.cache={folder / 'points'}", f"out={out}"]
+    return ["train", *street_at(folder / "street"), *SHORT, f"cache={folder / 'kept'}", f"out={out}"]
 
 
 @pytest.mark.stress
