@@ -13,7 +13,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -65,7 +65,7 @@ class Kept:
         """Return the answer of ``make``: from its file, or computed and written there.
 
         Of several processes that ask at once one computes, the others wait. A damaged file is made anew, with a line
-        that says so. Nothing is kept that depends on a class from outside of this package, whose code is not known.
+        that says so. What depends on a class from outside of this package is not kept, with a line that says so.
 
         Args:
             name: of the file.
@@ -76,8 +76,12 @@ class Kept:
 
         Raises OSError before any work if the folder cannot be written.
         """
-        digest = None if self._folder is None else _digest((code_version(), self._said, name, said))
-        if self._folder is None or digest is None:
+        if self._folder is None:
+            return make()
+        try:
+            digest = _digest((code_version(), self._said, name, said))
+        except ForeignError as error:
+            log.info("%s is not kept for the next run: it depends on %s, whose code may change", name, error)
             return make()
         path = self._folder / f"{name}-{digest}.npz"
         read = _read(path, kinds)
@@ -118,16 +122,13 @@ def code_version() -> str:
     return digest.hexdigest()
 
 
-class _ForeignError(TypeError):
+class ForeignError(TypeError):
     """What was said is an object of a class from outside of this package."""
 
 
-def _digest(said: object) -> str | None:
-    """16 hexadecimal digits; None where a class from outside of this package is part of what was said."""
-    try:
-        return hashlib.sha256(json.dumps(_plain(said)).encode()).hexdigest()[:16]
-    except _ForeignError:
-        return None
+def _digest(said: object) -> str:
+    """16 hexadecimal digits. Raises ForeignError."""
+    return hashlib.sha256(json.dumps(_plain(said)).encode()).hexdigest()[:16]
 
 
 def _plain(value: Any) -> Any:
@@ -139,15 +140,15 @@ def _plain(value: Any) -> Any:
         return ["array", str(array.dtype), array.shape, hashlib.sha256(array.tobytes()).hexdigest()]
     if isinstance(value, Mapping):
         return ["items", [[_plain(key), _plain(entry)] for key, entry in value.items()]]
-    if isinstance(value, frozenset | set):
+    if isinstance(value, Set):
         return ["set", sorted(map(_plain, value))]
-    if isinstance(value, tuple | list):
+    if isinstance(value, Sequence):
         return ["list", [_plain(entry) for entry in value]]
     if isinstance(value, Path):
         return ["path", str(value)]
     kind = type(value)
     if not is_dataclass(value) or not kind.__module__.startswith("sparsestreet."):
-        raise _ForeignError(f"{kind.__module__}.{kind.__qualname__}")
+        raise ForeignError(f"{kind.__module__}.{kind.__qualname__}")
     return [kind.__qualname__, [[entry.name, _plain(getattr(value, entry.name))] for entry in fields(value)]]
 
 
