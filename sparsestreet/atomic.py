@@ -48,7 +48,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     # The suffix stays, because some writers choose the format by it.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    with _writable(path):
+    with writable(path):
         if path.is_dir():
             raise IsADirectoryError(0, "it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -77,7 +77,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     ['log.txt']
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with _writable(path):
+    with writable(path):
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise FileExistsError(0, "it exists and is no empty folder")
         temporary.mkdir(parents=True)
@@ -89,7 +89,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _writable(path: Path) -> Iterator[None]:
+def writable(path: Path) -> Iterator[None]:
+    """Say of an OSError of the block that ``path`` cannot be written, and why."""
     try:
         yield
     except OSError as error:

@@ -24,7 +24,7 @@ import numpy as np
 import scipy
 import torch
 
-from sparsestreet.atomic import acquire_lock, atomic_file, release_lock
+from sparsestreet.atomic import acquire_lock, atomic_file, release_lock, writable
 from sparsestreet.files import read_npz
 
 log = logging.getLogger(__name__)
@@ -212,8 +212,9 @@ def _unpacked(tree: Any, arrays: Mapping[str, np.ndarray], kinds: Mapping[str, t
 def _alone(path: Path) -> Iterator[None]:
     """No other process makes this file while the block runs."""
     lock = path.with_name(f".{path.name}.lock")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    held = acquire_lock(lock)
+    with writable(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        held = acquire_lock(lock)
     if held is None:
         log.info("%s is being made by another process: waiting for it", path)
     while held is None:

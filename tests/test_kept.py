@@ -53,7 +53,7 @@ def same(one: object, other: object) -> bool:
 ANSWERS = {
     "nothing": None,
     "plain": ("a", 3, True, 0.1 + 0.2, float("nan"), float("-inf"), [None, ""], ()),
-    "tensors": [torch.rand(2, 3).T, torch.zeros(0, 3), torch.tensor(1.5), torch.arange(3) > 1, torch.full((2,), torch.nan)],
+    "tensors": [torch.rand(2, 3).T, torch.zeros(0, 3), torch.tensor(1.5), torch.arange(3) > 1, torch.full((2,), 9e9)],
     "arrays": {3: np.arange(4)[::2], "": np.zeros((0, 2), np.float32)},
     "dataclasses": {0: Hood(torch.ones(2, 2, dtype=torch.bool), 0.5), 2: Points(torch.rand(2, 3), torch.rand(2, 3))},
 }  # fmt: skip
@@ -176,6 +176,13 @@ def test_a_damaged_file_is_made_anew_and_said_once(damage, tmp_path, caplog):
     assert said.startswith(f"{path} is damaged (")
     assert "\n" not in said
     assert path.read_bytes() == sound
+
+
+def test_a_folder_that_cannot_be_written_is_told_of_before_any_work(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=r"cannot be written .*: name another place"):
+        Kept(tmp_path / "file").get("answer", (), asked := Asked())
+    assert asked.times == 0
 
 
 def test_an_error_or_a_kill_leaves_nothing_that_is_found(tmp_path):
