@@ -178,7 +178,7 @@ class DrivingLog:
 
     @cached_property
     def _bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        return self.kept.get("bounds", self.first_axes is not None, self._measured_bounds)
+        return self.kept.get("bounds", (), self._measured_bounds)
 
     def _measured_bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
         """Corners of the box around the camera centers and the 2 % to 98 % quantiles of the lidar points.

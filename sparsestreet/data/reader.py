@@ -139,18 +139,27 @@ class LogReader(ABC):
         return LogFiles(recorded=[path for path in self.folder.rglob("*") if path.is_file()])
 
     def identity(self) -> str | None:
-        """Hash of the files as they are (name, size, time of the last change) and of how they are read.
+        """Hash of what is read and how: ``data_hash``, size and time of the last change of each file, and the settings.
 
-        None for a reader from outside of this package: nobody knows when its code changes.
+        Unlike ``data_hash`` it changes with any byte, and with the place. None for a reader from outside of this
+        package: nobody knows when its code changes.
         """
         if not type(self).__module__.startswith("sparsestreet."):
             return None
+        states = sorted((str(path), path.stat()) for path in self.watched() if path.is_file())
+        settings = [(entry.name, repr(getattr(self, entry.name))) for entry in fields(cast(Any, self))]
+        said = [
+            type(self).__name__,
+            self.data_hash(),
+            [setting for setting in settings if setting[0] != "cache_mb"],  # time, not content
+            [(name, state.st_size, state.st_mtime_ns) for name, state in states],
+        ]
+        return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+
+    def watched(self) -> Iterator[Path]:
+        """All files that are read, those beside the log too; some may not be there."""
         files = self.files()
-        states = [(str(path), path.stat()) for path in (*files.described, *files.recorded) if path.is_file()]
-        said = [(entry.name, repr(getattr(self, entry.name))) for entry in fields(cast(Any, self))]
-        said = [pair for pair in said if pair[0] != "cache_mb"]  # time, not content
-        described = sorted((name, state.st_size, state.st_mtime_ns) for name, state in states)
-        return hashlib.sha256(json.dumps([type(self).__name__, said, described]).encode()).hexdigest()
+        yield from (*files.described, *files.recorded)
 
     def data_hash(self) -> str:
         """12 hexadecimal digits that are equal for the same log, wherever it lies (``hash_files``)."""

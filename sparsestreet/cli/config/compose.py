@@ -245,6 +245,7 @@ def load_run_config(run: Path) -> DictConfig:
     cfg = load_config(path)
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.
     cfg.folder = str(run)
+    cfg.cache = None  # it lies beside what ``out`` was, which only that app could resolve
     if isinstance(cfg.get("image_points"), DictConfig):
         cfg.image_points.pop("cache", None)  # of earlier versions, whose points lay in a folder of their own
     try:
@@ -272,7 +273,7 @@ def _find_log(cfg: DictConfig, launch: Path) -> None:
         raise ValueError(f"{launch} is damaged: it does not say where the run was started (hydra.runtime.cwd)")
     started = Path(cwd)
     if started.is_dir():
-        for key in ("data.root", "data.log.root", "data.log.parent", "cache"):
+        for key in ("data.root", "data.log.root", "data.log.parent"):
             folder = OmegaConf.select(cfg, key)
             if folder is not None:
                 OmegaConf.update(cfg, key, str(started / folder))

@@ -327,12 +327,13 @@ def _planned(name: str, settings: EffectSettings, data: TrainingData) -> Planned
 def _found(name: str, settings: EffectSettings, data: TrainingData) -> Finding:
     """What is detected; a finding that is kept from an earlier run detects anew where its pictures are asked for."""
     detected: list[Finding] = []
+    said = replace(settings, when="auto", learning_rates={})  # which are no matter of the log
 
     def detect() -> Finding:
         detected.append(settings.detect(data))
         return replace(detected[0], evidence=tuple)
 
-    kept = data.log.kept.get(f"effect-{name}", settings, detect, Finding)
+    kept = data.log.kept.get(f"effect-{name}", said, detect, Finding)
     return detected[0] if detected else replace(kept, evidence=lambda: settings.detect(data).evidence())
 
 
