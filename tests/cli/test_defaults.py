@@ -111,7 +111,6 @@ DIFFERENT = {
     "DeformableSettings.min_displacement",
     "DeformableSettings.min_gaussians",
     "Depth.nearest_rendered",
-    "ImagePointSettings.cache",
     "MaskSparsity.weight",
     "SmplSettings.min_gaussians",
     "SmplSettings.sh_degree",
