@@ -91,4 +91,4 @@ figure: $(VENV)/.ok ## quality against training and frame time on the default st
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/readme figure=docs/figures/time.png; exit $$status
 
 clean: ## removes what the targets made
-	rm -rf $(VENV) build outputs/demo outputs/site outputs/streets
+	rm -rf $(VENV) build outputs/demo outputs/site outputs/streets outputs/cache

@@ -1,4 +1,7 @@
-"""Files and folders that appear whole or not at all. A reader never sees half of one; a crash leaves the old one."""
+"""Files and folders that appear whole or not at all, and locks that the kernel releases when their process dies.
+
+A reader never sees half of a file; a crash leaves the old one.
+"""
 
 import errno
 import os
@@ -45,7 +48,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
     """
     # The suffix stays, because some writers choose the format by it.
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    with _writable(path):
+    with writable(path):
         if path.is_dir():
             raise IsADirectoryError(0, "it is a folder")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -74,7 +77,7 @@ def atomic_folder(path: Path) -> Iterator[Path]:
     ['log.txt']
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    with _writable(path):
+    with writable(path):
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             raise FileExistsError(0, "it exists and is no empty folder")
         temporary.mkdir(parents=True)
@@ -86,7 +89,8 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _writable(path: Path) -> Iterator[None]:
+def writable(path: Path) -> Iterator[None]:
+    """Say of an OSError of the block that ``path`` cannot be written, and why."""
     try:
         yield
     except OSError as error:
@@ -122,3 +126,36 @@ def _full(path: Path, error: Exception) -> OSError:
         f"{path} cannot be written ({reason}): {free / 1e6:,.1f} MB are free there. What stood there before is whole; "
         "make room and repeat the command"
     )
+
+
+def acquire_lock(path: Path) -> int | None:
+    """Take the lock of a file, which is made; answers at once with its descriptor, None where somebody else holds it.
+
+    Raises OSError where the file cannot be made.
+    """
+    import fcntl  # Windows has none
+
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            return None
+        if _is_there(path, descriptor):
+            return descriptor
+        os.close(descriptor)  # whoever held it removed the file in between
+
+
+def release_lock(path: Path, descriptor: int) -> None:
+    """Remove the file and give its lock up."""
+    if _is_there(path, descriptor):
+        path.unlink()
+    os.close(descriptor)
+
+
+def _is_there(path: Path, descriptor: int) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False

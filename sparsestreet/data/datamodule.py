@@ -10,7 +10,7 @@ from lightning import LightningDataModule
 from torch import Tensor
 
 from sparsestreet.data.frame_cache import Prefetcher, prefetched, to_device
-from sparsestreet.data.hood import find_dirt, find_hoods, with_ego
+from sparsestreet.data.hood import Hood, find_dirt, find_hoods, with_ego
 from sparsestreet.data.lazy import Frames, spread
 from sparsestreet.data.lidar import recolored
 from sparsestreet.data.log import DrivingLog, split
@@ -171,6 +171,7 @@ class StreetData(LightningDataModule):
         super().__init__()
         if val_frames is not None and val_frames < 1:
             raise ValueError(f"val_frames must be at least 1, got {val_frames}: say null for all held-out images")
+        log = replace(log, kept=log.kept.within(stride, offset, cameras, hood, dirt))
         log = log.holding_out(split(log, stride=stride, offset=offset, cameras=cameras).held_out_indices)
         log = _masked(log, split(log, stride=stride, offset=offset, cameras=cameras).train, hood, dirt)
         self.split = split(log, stride=stride, offset=offset, cameras=cameras)
@@ -235,9 +236,11 @@ class StreetData(LightningDataModule):
 
 def _masked(log: DrivingLog, train: Frames, hood: float | None, dirt: float | None) -> DrivingLog:
     """Return the log whose frames have in ``ego`` what training frames show of hoods and dirt, from these shares on."""
-    hoods = {} if hood is None else find_hoods(train, log.sweeps)
+    sweeps, tracks = log.sweeps, log.tracks
+    hoods = {} if hood is None else log.kept.get("hoods", (), lambda: find_hoods(train, sweeps), Hood)
     hidden = {camera: found.mask for camera, found in hoods.items() if hood is not None and found.share >= hood}
-    spots = {} if dirt is None else find_dirt(with_ego(train, hidden), log.sweeps, log.tracks)
+    seen = with_ego(train, hidden)
+    spots = {} if dirt is None else log.kept.get("dirt", (), lambda: find_dirt(seen, sweeps, tracks), Hood)
     for camera, found in spots.items():
         if dirt is not None and float(found.mask.float().mean()) >= dirt:
             hidden[camera] = found.mask | hidden[camera] if camera in hidden else found.mask

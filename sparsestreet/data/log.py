@@ -14,6 +14,7 @@ from sparsestreet.data.hood import Hood
 from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.tracks import repeated
 from sparsestreet.geometry.trajectories import frame_periods
+from sparsestreet.kept import NOTHING, Kept
 from sparsestreet.types import Frame, SparsePoints, Track, View
 
 _ABSENT = {
@@ -106,6 +107,9 @@ class DrivingLog:
 
     vehicle: VehiclePath | None = None
     """None: the log tells where its cameras were, but not the car that carried them."""
+    kept: Kept = NOTHING
+    """What earlier runs found out about this very log; who changes its frames or boxes takes a new one. By default
+    nothing is kept."""
 
     def __post_init__(self) -> None:
         """Raise ValueError where two objects have one name: layouts and nodes know them by it."""
@@ -174,6 +178,9 @@ class DrivingLog:
 
     @cached_property
     def _bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+        return self.kept.get("bounds", (), self._measured_bounds)
+
+    def _measured_bounds(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
         """Corners of the box around the camera centers and the 2 % to 98 % quantiles of the lidar points.
 
         Points that some camera sees count (DriveStudio's rule); without lidar, the points that came with the log, and

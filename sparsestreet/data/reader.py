@@ -1,11 +1,12 @@
 """What every data set offers: to be checked, and to be read."""
 
 import hashlib
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
@@ -136,6 +137,29 @@ class LogReader(ABC):
         A reader of one scene out of a data set, or of some frames and cameras, names those that it reads.
         """
         return LogFiles(recorded=[path for path in self.folder.rglob("*") if path.is_file()])
+
+    def identity(self) -> str | None:
+        """Hash of what is read and how: ``data_hash``, size and time of the last change of each file, and the settings.
+
+        Unlike ``data_hash`` it changes with any byte, and with the place. None for a reader from outside of this
+        package: nobody knows when its code changes.
+        """
+        if not type(self).__module__.startswith("sparsestreet."):
+            return None
+        states = sorted((str(path), path.stat()) for path in self.watched() if path.is_file())
+        settings = [(entry.name, repr(getattr(self, entry.name))) for entry in fields(cast(Any, self))]
+        said = [
+            type(self).__name__,
+            self.data_hash(),
+            [setting for setting in settings if setting[0] != "cache_mb"],  # time, not content
+            [(name, state.st_size, state.st_mtime_ns) for name, state in states],
+        ]
+        return hashlib.sha256(json.dumps(said).encode()).hexdigest()
+
+    def watched(self) -> Iterator[Path]:
+        """All files that are read, those beside the log too; some may not be there."""
+        files = self.files()
+        yield from (*files.described, *files.recorded)
 
     def data_hash(self) -> str:
         """12 hexadecimal digits that are equal for the same log, wherever it lies (``hash_files``)."""

@@ -259,6 +259,11 @@ class RecordedReader(LogReader):
         """Masks that somebody made."""
         return GivenMasks(None if self.masks is None else Path(self.masks))
 
+    def watched(self) -> Iterator[Path]:
+        yield from super().watched()
+        if self.masks is not None:
+            yield from Path(self.masks).rglob("*.png")
+
     @abstractmethod
     def recording(self) -> Recording:
         """What is in the files, nothing large decoded. Raises LogError with every problem found, ValueError where the

@@ -12,6 +12,7 @@ from torch.nn.functional import conv2d
 
 from sparsestreet.data.images import WHITE
 from sparsestreet.data.lazy import Frames, spread
+from sparsestreet.kept import NOTHING, Kept
 from sparsestreet.types import Frame
 
 MAX_FRAMES = 36
@@ -70,8 +71,12 @@ def light_warnings(light: Light) -> Iterator[str]:
         )
 
 
-def measured_light(frames: Frames) -> Light:
-    """Return the light of a spread of the images."""
+def measured_light(frames: Frames, kept: Kept = NOTHING) -> Light:
+    """Return the light of a spread of the images, which are those that ``kept`` is about."""
+    return kept.get("light", (), lambda: _measured(frames), Light)
+
+
+def _measured(frames: Frames) -> Light:
     places = spread(len(frames), MAX_FRAMES)
     rows = np.array([_of(frames[place]) for place in places])
     levels, noise, clipped = rows.T

@@ -32,7 +32,7 @@ IDENTITY_KEYS = (
     "data.log.root",
     "data.log.parent",
     "data.log.cache_mb",
-    "image_points.cache",  # where points lie and how many threads make them; the points are the same
+    "cache",  # where answers lie, and how many threads make points: they are the same
     "image_points.threads",
     "split.val_frames",
     "callback.*.path",  # where something is written

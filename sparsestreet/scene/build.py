@@ -15,7 +15,7 @@ from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
-from sparsestreet.triangulation import ImagePointSettings, cached_street_points
+from sparsestreet.triangulation import ImagePointSettings, kept_street_points
 from sparsestreet.types import Track
 
 
@@ -81,7 +81,7 @@ def build_scene(
     _report(assignment)
     moving = without_frames(assignment.claimed, held_out)
     with stage("points"):
-        points = None if image_points is None else cached_street_points(train_frames, moving, image_points)
+        points = None if image_points is None else kept_street_points(log.kept, train_frames, moving, image_points)
     built: dict[str, Node] = {}
     for name, settings in nodes.items():
         data = TrainingData(log, train_frames, held_out, assignment.by_node[name], moving, points)

@@ -52,6 +52,12 @@ class Probe:
     options: RenderOptions
     seed: int
 
+    def kept_gain(self, plan: EffectPlan, name: str) -> ProbedGain | None:
+        """Return ``gain``, from an earlier run on the same log, if one kept it."""
+        on = [(one.name, one.settings, one.on) for one in plan.effects]
+        said = self.nodes, self.losses, self.optimizer, self.options, self.seed, on
+        return self.log.kept.get(f"probe-{name}", said, lambda: self.gain(plan, name), ProbedGain)
+
     def gain(self, plan: EffectPlan, name: str) -> ProbedGain | None:
         """Return by how much views that the probe holds out are better with an effect of a plan than without it.
 

@@ -112,7 +112,7 @@ class Recipe:
                 self.options,
                 self.seed,
             )
-            gain = probe.gain(plan, name)
+            gain = probe.kept_gain(plan, name)
             if gain is not None:
                 plan = plan.switched(name, gain.is_certain, gain)
         return plan
@@ -185,7 +185,7 @@ class RunIdentity:
             noise=None,
             caps={},
             effects=effects,
-            light=measured_light(data.split.train).numbers(),
+            light=measured_light(data.split.train, data.driving_log.kept).numbers(),
             machine=this_machine(),
             source=this_source(),
         )

@@ -176,11 +176,15 @@ def build(recipe: Recipe, data: StreetData, plan: EffectPlan) -> StreetSystem:
     for note in data.driving_log.notes:
         log.info(note)
     with stage("initialize"):
-        train = data.split.train
-        check_used(train, data.driving_log.name)
-        for doubt in (*log_warnings(data.driving_log, train), *light_warnings(measured_light(train))):
+        train, street = data.split.train, data.driving_log
+        check_used(train, street.name)
+        doubts = street.kept.get("doubts", (), lambda: tuple(log_warnings(street, train)))
+        for doubt in (*doubts, *light_warnings(measured_light(train, street.kept))):
             log.warning(doubt)
-        return recipe.build(data, plan)
+        system = recipe.build(data, plan)
+    if street.kept:
+        log.info("%s", street.kept)
+    return system
 
 
 def fit(

@@ -6,6 +6,6 @@ disk.
 """
 
 from sparsestreet.triangulation.points import ImagePointSettings, TriangulatedPoints
-from sparsestreet.triangulation.street import StreetPoints, cached_street_points, street_points
+from sparsestreet.triangulation.street import StreetPoints, kept_street_points, street_points
 
-__all__ = ["ImagePointSettings", "StreetPoints", "TriangulatedPoints", "cached_street_points", "street_points"]
+__all__ = ["ImagePointSettings", "StreetPoints", "TriangulatedPoints", "kept_street_points", "street_points"]

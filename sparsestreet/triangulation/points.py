@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
 from sparsestreet.triangulation.matches import NEAREST, Features, guided_matches, image_pairs, in_image
@@ -32,16 +32,20 @@ class ImagePointSettings:
     Windows of a house repeat, but only the right match is seen from all views."""
     max_depth_error: float = 0.03
     """Largest standard deviation of a point's position divided by its distance, from parallax and feature noise."""
-    threads: int = 2
-    cache: Path | str | None = None
-    """Folder for computed points; None: every run computes them anew."""
+    threads: int | None = None
+    """That work at once; None: as many as this process has for its tensors (torch's), by default one a core."""
 
     def __post_init__(self) -> None:
         for name in ("features", "threads"):
-            if getattr(self, name) < 1:
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ValueError(f"points from images need {name} of at least 1, got {getattr(self, name)}")
         if self.min_views < 2:
             raise ValueError(f"a point must be seen in at least 2 views to be triangulated, got {self.min_views}")
+
+    @property
+    def workers(self) -> int:
+        """How many threads work."""
+        return self.threads or torch.get_num_threads()
 
 
 GAUSS_NEWTON_STEPS = 4
@@ -255,7 +259,7 @@ def _all_matches(
         return found + starts[list(pair)]
 
     parts: list[Int[np.ndarray, "k 2"]] = [np.zeros((0, 2), np.int64)]
-    with ThreadPoolExecutor(settings.threads) as executor:
+    with ThreadPoolExecutor(settings.workers) as executor:
         for done, part in enumerate(executor.map(compare, pairs), start=1):
             parts.append(part)
             if progress is not None:

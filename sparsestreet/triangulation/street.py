@@ -1,24 +1,20 @@
 """The points of a drive: static ones in the world, and those of each box in its own frame."""
 
-import hashlib
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from threading import Lock
+from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 
-from sparsestreet.atomic import atomic_file
 from sparsestreet.data.lazy import Frames
-from sparsestreet.files import read_npz
 from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.lenses import undistort
+from sparsestreet.kept import Kept
 from sparsestreet.triangulation.matches import Features, find_features
 from sparsestreet.triangulation.points import ImagePointSettings, Sighting, TriangulatedPoints, triangulate
 from sparsestreet.types import Camera, Frame, Track, View
@@ -73,15 +69,12 @@ def _report(done: int, total: int) -> None:
 
 
 def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:
-    """Sightings in the order of the frames. OpenCV releases the interpreter's lock, so threads run in parallel."""
-    reading = Lock()  # one frame is decoded at a time: the threads are for the features
+    """Sightings in the order of the frames. What decodes images, and OpenCV, release the interpreter's lock."""
 
     def sighting(index: int) -> Sighting:
-        with reading:
-            frame = frames[index]
-        return _sighting(frames.views[index], frame, settings.features)
+        return _sighting(frames.views[index], frames[index], settings.features)
 
-    with ThreadPoolExecutor(settings.threads) as executor:
+    with ThreadPoolExecutor(settings.workers) as executor:
         return list(executor.map(sighting, range(len(frames))))
 
 
@@ -150,65 +143,10 @@ def _inside(points: TriangulatedPoints, views: list[int], track: Track) -> Trian
     )
 
 
-VERSION = 1
-"""Raised whenever the same images and settings would give other points."""
-
-_COLUMNS = ("positions", "colors", "pixel_sizes", "observed", "views", "pixels")
-
-
-def cached_street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
-    """Return ``street_points``, from the cache if the same images, poses, boxes and settings made them before.
-
-    Raises OSError before any work if the cache cannot be written.
-    """
-    if settings.cache is None:
-        return street_points(frames, moving, settings)
-    path = Path(settings.cache) / f"{_key(frames, moving, settings)}.npz"
-    if path.is_file() and (kept := _read(path)) is not None:
-        log.info("points from images: taken from %s", path)
-        return kept
-    with atomic_file(path) as unfinished:
-        points = street_points(frames, moving, settings)
-        _write(unfinished, points)
-    return points
-
-
-def _key(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> str:
-    said = asdict(settings) | {"version": VERSION, "opencv": cv2.__version__}
-    for name in ("threads", "cache"):  # they change the time, not the points
-        said.pop(name)
-    digest = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
-    for frame in frames:
-        camera = frame.camera
-        digest.update(f"{frame.frame_index} {frame.camera_index} {camera.width} {camera.height}".encode())
-        for tensor in (camera.camera_from_world, camera.intrinsics, camera.distortion, frame.image, frame.sky):
-            digest.update(b"-" if tensor is None else tensor.numpy().tobytes())
-        if frame.ego is not None:
-            digest.update(frame.ego.numpy().tobytes())
-    for track in moving:
-        digest.update(track.name.encode())
-        for tensor in (track.frames, track.world_from_object, track.size):
-            digest.update(tensor.numpy().tobytes())
-        if track.times is not None:  # the box at a view's time lies between two annotated ones
-            digest.update(track.times.numpy().tobytes())
-    if any(track.times is not None for track in moving):
-        digest.update(json.dumps([view.time for view in frames.views]).encode())
-    return digest.hexdigest()[:16]
-
-
-def _write(path: Path, points: StreetPoints) -> None:
-    parts = [points.static, *points.in_boxes.values()]
-    tables = {f"{column}_{number}": getattr(part, column) for number, part in enumerate(parts) for column in _COLUMNS}
-    np.savez(path, names=np.array(list(points.in_boxes), dtype=np.str_), **tables)
-
-
-def _read(path: Path) -> StreetPoints | None:
-    """None, and a warning, for a file that is damaged."""
-    try:
-        tables = read_npz(path)
-        count = len(tables["names"]) + 1
-        parts = [TriangulatedPoints(*(tables[f"{column}_{number}"] for column in _COLUMNS)) for number in range(count)]
-        return StreetPoints(parts[0], dict(zip(tables["names"].tolist(), parts[1:], strict=True)))
-    except (ValueError, KeyError, TypeError) as error:
-        log.warning("points from images: %s is damaged (%s), so they are made anew", path, error)
-        return None
+def kept_street_points(
+    kept: Kept, frames: Frames, moving: Sequence[Track], settings: ImagePointSettings
+) -> StreetPoints:
+    """Return ``street_points``, from an earlier run on the same images if one kept them."""
+    said = replace(settings, threads=None), cv2.__version__, moving  # threads change the time, not the points
+    make = partial(street_points, frames, moving, settings)
+    return kept.get("points", said, make, StreetPoints, TriangulatedPoints)

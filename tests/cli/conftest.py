@@ -57,7 +57,7 @@ def tiny_street(tmp_path_factory) -> list[str]:
         *street_at(root),
         "effects.sky.resolution=8",
         *TINY_BACKGROUND,
-        f"image_points.cache={root.parent / 'points'}",
+        f"cache={root.parent / 'kept'}",
         "schedule.max_steps=60",
         "schedule.refine_in.every=10",
         "schedule.mask_in.every=10",

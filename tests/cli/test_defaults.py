@@ -69,10 +69,9 @@ def streetgs() -> Recipe:
 
 def test_streetgs_from_python_is_the_commands():
     said = recipe_of(composed([]))
-    assert said.image_points is not None
-    # The folder in which runs share points, and a limit that says what its absence means, are the command's.
+    # A limit that says what its absence means is the command's.
     losses = {**said.losses, "depth": replace(as_a(Depth, said.losses["depth"]), nearest_rendered=None)}
-    said = replace(said, losses=losses, image_points=replace(said.image_points, cache=None))
+    said = replace(said, losses=losses)
     usual = streetgs()
     for entry in fields(Recipe):
         if entry.name != "callbacks":
@@ -112,7 +111,6 @@ DIFFERENT = {
     "DeformableSettings.min_displacement",
     "DeformableSettings.min_gaussians",
     "Depth.nearest_rendered",
-    "ImagePointSettings.cache",
     "MaskSparsity.weight",
     "SmplSettings.min_gaussians",
     "SmplSettings.sh_degree",

@@ -13,6 +13,7 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from sparsestreet.atomic import acquire_lock, release_lock
 from sparsestreet.cli import READER_GONE
 from sparsestreet.cli.commands.evaluate import _device
 from sparsestreet.cli.commands.options import run_command
@@ -20,7 +21,7 @@ from sparsestreet.cli.commands.scenes import open_scene
 from sparsestreet.cli.config.validate import device_of, device_problem
 from sparsestreet.cli.process import SPINS, is_worker_rank, name_beside_first, set_log_prefix, use_passive_wait
 from sparsestreet.cli.runs import locks as device_module
-from sparsestreet.cli.runs.locks import LOCK, FolderTakenError, acquire, devices_of_job, release, sole_writer
+from sparsestreet.cli.runs.locks import LOCK, FolderTakenError, devices_of_job, sole_writer
 from tests.evaluation.frames import make_run
 
 
@@ -97,22 +98,22 @@ def test_a_second_writer_is_told_who_the_first_is_and_touches_nothing(tmp_path):
 
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
     """Its file is still there; a link in its place is no way to another file."""
-    code = "import sys, time; from sparsestreet.cli.runs.locks import acquire; from pathlib import Path; "
-    code += "acquire(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
+    code = "import sys, time; from sparsestreet.atomic import acquire_lock; from pathlib import Path; "
+    code += "acquire_lock(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
     path = tmp_path / "slot"
     process = subprocess.Popen([sys.executable, "-c", code, str(path)], stdout=subprocess.PIPE, text=True)
     assert process.stdout.readline() == "held\n"
-    assert acquire(path) is None
+    assert acquire_lock(path) is None
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert path.exists()
-    held = acquire(path)
+    held = acquire_lock(path)
     assert held is not None
-    release(path, held)
+    release_lock(path, held)
     assert not path.exists()
     path.symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OSError, match="slot"):
-        acquire(path)
+        acquire_lock(path)
     assert not (tmp_path / "elsewhere").exists()
 
 

@@ -1,5 +1,6 @@
 """The hash of a log: the same log in another place, and what changes it."""
 
+import os
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,6 +9,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from sparsestreet.data.drivestudio.annotations import role_of
+from sparsestreet.data.kitti import KittiReader
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.problems import Problem
 from sparsestreet.data.reader import LogFiles, LogReader, hash_files
@@ -116,3 +118,36 @@ def test_names_mean_what_the_configuration_of_their_data_set_says(name):
         pytest.skip(f"data={name} has no classes of its own")
     for role, names in classes.items():
         assert {one: role_of(one) for one in names} == dict.fromkeys(names, role)
+
+
+def test_the_identity_of_what_is_kept_changes_with_any_byte_and_setting(log):
+    """Where runs find each other's answers (``kept``): a byte in the midst of an image counts, a cache's size not."""
+    street = StreetReader(StreetSettings(seed=3), root=log)
+    readers = [
+        street, replace(street, lidar=False), replace(street, extent="first_pose"),
+        replace(street, settings=StreetSettings(seed=4)), replace(street, lidar_ahead=[-2, 80]),
+    ]  # fmt: skip
+    found = [reader.identity() for reader in readers]
+    assert len(set(found)) == len(readers)
+    assert replace(street, cache_mb=7).identity() == found[0]
+    content = bytearray(200_000)
+    content[100_000] = 1
+    (log / "images" / "0.bin").write_bytes(content)
+    os.utime(log / "images" / "0.bin", ns=(0, 1))  # a clock of files may tick every few milliseconds
+    changed = street.identity()
+    assert changed not in found
+    (log / "cameras.json").touch()
+    assert street.identity() not in [*found, changed]
+    assert AnyFolder(log).identity() is None  # of code that is not ours
+
+
+def test_masks_beside_a_log_are_part_of_the_identity(log, tmp_path, monkeypatch):
+    monkeypatch.setattr(KittiReader, "files", lambda self: LogFiles())
+    reader = KittiReader(root=log, masks=tmp_path / "masks")
+    before = reader.identity()
+    path = tmp_path / "masks" / "ego" / "image_02" / "0000000000.png"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(b"white")
+    drawn = reader.identity()
+    os.utime(path, ns=(0, 1))
+    assert len({before, drawn, reader.identity()}) == 3

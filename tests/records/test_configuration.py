@@ -21,7 +21,7 @@ def test_a_tree_becomes_flat():
         {"name": "mine"},
         {"data.root": "/elsewhere"},
         {"data.log.root": "/elsewhere"},
-        {"image_points.cache": "elsewhere"},
+        {"cache": "elsewhere"},
         {"image_points.threads": 8},
         {"resume": "last.ckpt"},
         {"logger": None},

@@ -68,12 +68,12 @@ def test_the_log_says_who_takes_what(caplog):
 def test_points_from_images_are_made_once_of_what_training_sees(monkeypatch):
     asked = []
 
-    def made(frames, moving, settings) -> StreetPoints:
+    def made(kept, frames, moving, settings) -> StreetPoints:
         asked.append(([view.frame_index for view in frames.views], [track.name for track in moving], settings))
         in_box = triangulated([[0.0, 0.0, 0.0]] * 5000)
         return StreetPoints(triangulated([[9.0, 0.0, 1.0]] * 7), {"driving": in_box})
 
-    monkeypatch.setattr("sparsestreet.scene.build.cached_street_points", made)
+    monkeypatch.setattr("sparsestreet.scene.build.kept_street_points", made)
     log = street_log()
     frames = log.frames.where(lambda view: view.frame_index != 3)
     nodes = {"background": background_settings(images=7), "cars": CARS}

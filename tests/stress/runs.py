@@ -29,7 +29,7 @@ def street_of(tiny_street: Sequence[str]) -> Path:
 
 def on_drive(drive: Path, out: Path) -> list[str]:
     """Words that train on a drive in DriveStudio's layout."""
-    return ["train", "data=drivestudio", f"data.root={drive}", *SHORT, f"out={out}", f"image_points.cache={out}.points"]
+    return ["train", "data=drivestudio", f"data.root={drive}", *SHORT, f"out={out}", f"cache={out}.kept"]
 
 
 def cut_short(finished: Path, run: Path) -> None:

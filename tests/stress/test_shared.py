@@ -19,7 +19,7 @@ RUNS = 8
 
 def words(folder: Path, out: Path) -> list[str]:
     """Of one run; the street is not there yet."""
-    return ["train", *street_at(folder / "street"), *SHORT, f"image_points.cache={folder / 'points'}", f"out={out}"]
+    return ["train", *street_at(folder / "street"), *SHORT, f"cache={folder / 'kept'}", f"out={out}"]
 
 
 @pytest.mark.stress
@@ -37,13 +37,20 @@ def test_eight_runs_share_their_caches(tmp_path):
         assert found.status == 0, found.said
         assert "Traceback" not in found.said
         assert "is damaged" not in found.said
-    assert sorted(path.name for path in shared.iterdir()) == ["points", *(run.name for run in runs), "street"]
-    for cached in ("points", "street"):
-        assert contents(alone / cached) == contents(shared / cached)
+    assert sorted(path.name for path in shared.iterdir()) == ["kept", *(run.name for run in runs), "street"]
+    assert contents(alone / "street") == contents(shared / "street")
+    # Names tell streets of other folders and times apart.
+    kept = [sorted(_answers(folder / "kept")) for folder in (alone, shared)]
+    assert kept[0] == kept[1]
     for run in runs:
         got = content(run)
         assert sorted(expected) == sorted(got)
         assert [name for name in expected if expected[name] != got[name]] == []
+
+
+def _answers(folder: Path) -> list[tuple[str, bytes]]:
+    """Names of what is kept, without what they depend on, and contents."""
+    return [(path.name.partition("-")[0], path.read_bytes()) for path in folder.iterdir()]
 
 
 @pytest.mark.lengthy

@@ -1,6 +1,7 @@
 """Points of a street whose depth is known at every pixel, and of bad pictures of it."""
 
 import json
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import torch
 from sparsestreet.data.lazy import Frames, as_frames
 from sparsestreet.data.synthetic.tracer import BACKGROUND
 from sparsestreet.geometry.lenses import distort
+from sparsestreet.kept import Kept
 from sparsestreet.triangulation import (
     ImagePointSettings,
     StreetPoints,
     TriangulatedPoints,
-    cached_street_points,
+    kept_street_points,
     street,
     street_points,
 )
@@ -205,18 +207,27 @@ def test_a_feature_takes_the_pixel_that_it_lies_in():
     assert (row.tolist(), column.tolist()) == ([2, 0, 2, 2], [3, 0, 4, 0])
 
 
-def test_frames_are_read_one_at_a_time_and_their_pixels_let_go(street):
-    """What a log remembers of its frames is not made for two threads."""
-    reading = []
+def test_threads_change_no_point(street, points):
+    """They decode images at the same time. The usual number is torch's, which may be any."""
+    for threads in (2, 5, None):
+        again = street_points(street.frames, _moving(street), replace(SETTINGS, threads=threads))
+        assert list(again.in_boxes) == list(points.in_boxes)
+        for one, other in zip(
+            (points.static, *points.in_boxes.values()), (again.static, *again.in_boxes.values()), strict=True
+        ):
+            assert vars(one).keys() == vars(other).keys()
+            assert all(np.array_equal(vars(one)[name], vars(other)[name]) for name in vars(one))
+
+
+def test_images_are_decoded_at_the_same_time(street):
+    """Two threads meet in the midst of it."""
+    both = threading.Barrier(2, timeout=60)
 
     def load(frame):
-        reading.append(frame)
-        assert len(reading) == 1
-        torch.rand(2000, 200).sort()  # long enough for another thread to come by
-        return reading.pop()
+        both.wait()
+        return frame
 
-    threads = replace(SETTINGS, threads=4, features=20)
-    street_points(Frames(list(street.frames)[:6], load), [], threads)
+    street_points(Frames(list(street.frames)[:6], load), [], replace(SETTINGS, threads=2, features=20))
 
 
 FRAMES = tuple(
@@ -250,8 +261,8 @@ def made(monkeypatch):
     return makings
 
 
-def _get(folder, frames=FRAMES, tracks=(TRACK,), **changes):
-    return cached_street_points(as_frames(frames), tracks, ImagePointSettings(cache=folder, **changes))
+def _get(folder, tracks=(TRACK,), **changes):
+    return kept_street_points(Kept(folder), as_frames(FRAMES), tracks, ImagePointSettings(**changes))
 
 
 def test_points_are_read_back_as_they_were(tmp_path, made):
@@ -277,107 +288,31 @@ def test_without_a_folder_points_are_made_anew(made):
     assert len(made) == 2
 
 
-def _other_camera(**changes):
-    return replace(FRAMES[0], camera=replace(FRAMES[0].camera, **changes))
-
-
-OTHERS = {
-    "image": replace(FRAMES[0], image=FRAMES[0].image + 1),
-    "sky": replace(FRAMES[0], sky=~FRAMES[0].sky),
-    "no sky": replace(FRAMES[0], sky=None),
-    "hood": replace(FRAMES[0], ego=torch.ones(4, 6, dtype=torch.bool)),
-    "pose": _other_camera(camera_from_world=2 * torch.eye(4)),
-    "intrinsics": _other_camera(intrinsics=2 * torch.eye(3)),
-    "distortion": _other_camera(distortion=torch.ones(5)),
-    "no distortion": _other_camera(distortion=None),
-    "size": _other_camera(width=4, height=6),
-    "instant": replace(FRAMES[0], frame_index=7),
-    "camera": replace(FRAMES[0], camera_index=7),
+BOXES = {
+    "none": (),
+    "name": (replace(TRACK, name="bus"),),
+    "frames": (replace(TRACK, frames=torch.tensor([0, 2])),),
+    "poses": (replace(TRACK, world_from_object=TRACK.world_from_object @ TURN),),
+    "size": (replace(TRACK, size=2 * TRACK.size),),
+    "times": (replace(TRACK, times=torch.tensor([0.0, 0.5], dtype=torch.float64)),),
+    "other times": (replace(TRACK, times=torch.tensor([0.0, 0.6], dtype=torch.float64)),),
 }
+LIMITS = {
+    "features": 7, "epipolar_tolerance": 0.7, "ratio": 0.7, "max_error": 0.7, "min_views": 4, "min_support": 0.7,
+    "max_depth_error": 0.7,
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("other", OTHERS.values(), ids=OTHERS)
-def test_another_frame_makes_other_points(tmp_path, made, other):
+def test_other_boxes_and_settings_make_other_points(tmp_path, made, monkeypatch):
+    """Threads make the same; images are a matter of the log (tests/cli/test_twice.py)."""
     _get(tmp_path)
-    _get(tmp_path, (other, FRAMES[1]))
-    assert len(made) == 2
-    _get(tmp_path, (other, FRAMES[1]))
-    assert len(made) == 2
-
-
-@pytest.mark.parametrize(
-    "tracks",
-    [
-        (),
-        (replace(TRACK, name="bus"),),
-        (replace(TRACK, frames=torch.tensor([0, 2])),),
-        (replace(TRACK, world_from_object=TRACK.world_from_object @ TURN),),
-        (replace(TRACK, size=2 * TRACK.size),),
-    ],
-    ids=["none", "name", "frames", "poses", "size"],
-)
-def test_other_boxes_make_other_points(tmp_path, made, tracks):
-    _get(tmp_path)
-    _get(tmp_path, tracks=tracks)
-    assert len(made) == 2
-
-
-def test_other_times_make_other_points_where_boxes_have_times(tmp_path, made):
-    """A box at the time of a view lies between two annotated ones."""
-    late = (FRAMES[0], replace(FRAMES[1], time=0.5))
-    _get(tmp_path)
-    _get(tmp_path, late)  # a log without a clock: the time says nothing that the frame does not
-    assert len(made) == 1
-    timed = replace(TRACK, times=torch.tensor([0.0, 0.5], dtype=torch.float64))
-    later = replace(TRACK, times=torch.tensor([0.0, 0.6], dtype=torch.float64))
-    for frames, track in ((FRAMES, timed), (FRAMES, later), (late, timed)):
-        _get(tmp_path, frames, tracks=(track,))
-    assert len(made) == 4
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"features": 7}, {"epipolar_tolerance": 0.7}, {"ratio": 0.7}, {"max_error": 0.7}, {"min_views": 4},
-        {"min_support": 0.7}, {"max_depth_error": 0.7},
-    ],
-    ids=str,
-)  # fmt: skip
-def test_other_settings_make_other_points(tmp_path, made, change):
-    _get(tmp_path)
-    _get(tmp_path, **change)
-    assert len(made) == 2
-
-
-def test_another_version_makes_other_points(tmp_path, made, monkeypatch):
-    _get(tmp_path)
-    monkeypatch.setattr(street, "VERSION", street.VERSION + 1)
-    _get(tmp_path)
-    assert len(made) == 2
-
-
-def test_threads_make_the_same(tmp_path, made):
-    _get(tmp_path)
+    for tracks in BOXES.values():
+        _get(tmp_path, tracks)
+    for name, limit in LIMITS.items():
+        _get(tmp_path, **{name: limit})
+    assert len(made) == 1 + len(BOXES) + len(LIMITS)
     _get(tmp_path, threads=5)
-    assert len(made) == 1
-
-
-def test_an_interrupted_making_leaves_nothing(tmp_path, made, monkeypatch):
-    def interrupted(path, points):
-        path.write_bytes(b"half")
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(street, "_write", interrupted)
-        with pytest.raises(KeyboardInterrupt):
-            _get(tmp_path)
-    assert list(tmp_path.iterdir()) == []
+    assert len(made) == 1 + len(BOXES) + len(LIMITS)
+    monkeypatch.setattr(street.cv2, "__version__", "5.1")
     _get(tmp_path)
-    assert len(made) == 2
-
-
-def test_a_folder_that_cannot_be_written_is_told_of_before_any_work(tmp_path, made):
-    (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="cannot be written"):
-        _get(tmp_path / "file")
-    assert made == []
+    assert len(made) == 2 + len(BOXES) + len(LIMITS)

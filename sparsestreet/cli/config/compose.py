@@ -78,10 +78,10 @@ register_options()
 register_resolvers()
 
 
-MOVED = {"data.log.min_lens_shift": "effects.lens.min_shift"}
+MOVED = {"data.log.min_lens_shift": "effects.lens.min_shift", "image_points.cache": "cache"}
 """Keys of earlier versions -> where their value belongs now."""
 PATHS = {
-    *("out", "resume", "count_of", "trunk", "data.root", "data.log.root", "data.log.parent", "image_points.cache"),
+    *("out", "resume", "count_of", "trunk", "data.root", "data.log.root", "data.log.parent", "cache"),
     *("hydra.run.dir", "hydra.sweep.dir"),
 }
 """Keys whose value is a path, in whatever letters."""
@@ -105,6 +105,7 @@ class TrainSchema:
     checkpoint_every: Any = MISSING
     branch_points: list[float] = field(default_factory=list)
     count_of: str | None = None
+    cache: str | None = None
     data: Tree = MISSING
     schedule: Tree = MISSING
     assignment: Tree = MISSING
@@ -244,6 +245,9 @@ def load_run_config(run: Path) -> DictConfig:
     cfg = load_config(path)
     # Written as an interpolation that only a running app can resolve; and runs may have been moved.
     cfg.folder = str(run)
+    cfg.cache = None  # it lies beside what ``out`` was, which only that app could resolve
+    if isinstance(cfg.get("image_points"), DictConfig):
+        cfg.image_points.pop("cache", None)  # of earlier versions, whose points lay in a folder of their own
     try:
         _find_log(cfg, run / ".hydra" / "hydra.yaml")
     except OmegaConfBaseException as error:

@@ -1,6 +1,5 @@
 """Locks that the kernel releases when their process dies: of a run's folder, and of the device that a job gets."""
 
-import fcntl
 import os
 import socket
 import tempfile
@@ -12,6 +11,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from sparsestreet.atomic import acquire_lock, release_lock
 from sparsestreet.cli.config.validate import named_devices, on_gpu
 from sparsestreet.cli.process import shares_a_run
 
@@ -33,7 +33,7 @@ def sole_writer(out: Path) -> Iterator[None]:
     """
     path = out / LOCK
     out.mkdir(parents=True, exist_ok=True)
-    held = acquire(path)
+    held = acquire_lock(path)
     if held is None:
         raise FolderTakenError(
             f"{out} is being written by {_holder(path)}: wait for that run, end it, or name another place with out=..."
@@ -43,38 +43,7 @@ def sole_writer(out: Path) -> Iterator[None]:
         os.write(held, f"process {os.getpid()} on {socket.gethostname()}".encode())
         yield
     finally:
-        release(path, held)
-
-
-def acquire(path: Path) -> int | None:
-    """Take the lock of a file, which is made; answers at once with its descriptor, None where somebody else holds it.
-
-    Raises OSError where the file cannot be made.
-    """
-    while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            os.close(descriptor)
-            return None
-        if _is_there(path, descriptor):
-            return descriptor
-        os.close(descriptor)  # whoever held it removed the file in between
-
-
-def release(path: Path, descriptor: int) -> None:
-    """Remove the file and give its lock up."""
-    if _is_there(path, descriptor):
-        path.unlink()
-    os.close(descriptor)
-
-
-def _is_there(path: Path, descriptor: int) -> bool:
-    try:
-        return os.path.samestat(path.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
+        release_lock(path, held)
 
 
 def _holder(path: Path) -> str:
@@ -115,12 +84,12 @@ def least_held(names: Sequence[str]) -> Iterator[int]:
     for slot in count():
         for place, name in enumerate(names):
             path = folder / f"{name}.{slot}"
-            held = acquire(path)
+            held = acquire_lock(path)
             if held is not None:
                 try:
                     yield place
                 finally:
-                    release(path, held)
+                    release_lock(path, held)
                 return
 
 

@@ -4,6 +4,7 @@ import logging
 import shlex
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from sparsestreet.cli.runs.folder import lies_in, moments_to_keep, start_from_tr
 from sparsestreet.cli.runs.locks import devices_of_job
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.evaluation.speed import forget_peaks
+from sparsestreet.kept import Kept
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.rendering import RenderOptions
@@ -59,7 +61,10 @@ def _render_options(cfg: DictConfig) -> RenderOptions:
 def data_of(cfg: DictConfig) -> StreetData:
     """The log, and its split into views to train on and views held out. Raises ValueError for a key that has moved."""
     check_moved(cfg)
-    log = reader_of(cfg).read()
+    reader = reader_of(cfg)
+    log = reader.read()
+    if (identity := reader.identity()) is not None:
+        log = replace(log, kept=Kept(cfg.get("cache"), identity))
     # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
     return StreetData(log, **cfg.split, seed=cfg.seed, hood=_masked_from(cfg, "hood"), dirt=_masked_from(cfg, "dirt"))
 

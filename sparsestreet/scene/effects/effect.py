@@ -368,11 +368,24 @@ _OFF = Finding(called_for=False, reason="the configuration says so")
 
 def _planned(name: str, settings: EffectSettings, data: TrainingData) -> PlannedEffect:
     when = settings.when
-    finding = _OFF if when == "off" and not settings.found_when_off else settings.detect(data)
+    finding = _OFF if when == "off" and not settings.found_when_off else _found(name, settings, data)
     if when == "on" and finding.missing is not None:
         raise ValueError(f"effects.{name} is on, but {finding.reason}: {finding.missing}, or say auto")
     on = when == "on" or (when == "auto" and finding.called_for and not finding.missing)
     return PlannedEffect(name, settings, finding, on)
+
+
+def _found(name: str, settings: EffectSettings, data: TrainingData) -> Finding:
+    """What is detected; a finding that is kept from an earlier run detects anew where its pictures are asked for."""
+    detected: list[Finding] = []
+    said = replace(settings, when="auto", learning_rates={})  # which are no matter of the log
+
+    def detect() -> Finding:
+        detected.append(settings.detect(data))
+        return replace(detected[0], evidence=tuple)
+
+    kept = data.log.kept.get(f"effect-{name}", said, detect, Finding)
+    return detected[0] if detected else replace(kept, evidence=lambda: settings.detect(data).evidence())
 
 
 def _pixels(data: TrainingData) -> int:

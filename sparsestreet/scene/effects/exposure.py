@@ -83,10 +83,10 @@ class ExposureSettings(EffectSettings):
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "Exposure":
         """Start from the gains that are measured on all images, without drift; from none where nothing is measured."""
-        made = Exposure(self, _times(data.views))
-        gains = _measured(data, most=None)
+        made, views = Exposure(self, _times(data.views)), {view.indices: view for view in data.views}
+        gains = data.log.kept.get("gains", (), lambda: _of_all(data))
         if gains is not None:
-            made.start_from(gains.views, without_drift(gains))
+            made.start_from([views[indices] for indices in gains[0]], gains[1])
         return made
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "Exposure":
@@ -166,6 +166,12 @@ class Exposure(Effect):
 
 def _measured(data: TrainingData, **most: None) -> ImageGains | None:
     return image_gains(data.frames, data.sweeps, without_frames(data.log.tracks, data.held_out), **most)
+
+
+def _of_all(data: TrainingData) -> tuple[list[tuple[int, int]], Float[Tensor, "n 3"]] | None:
+    """Frame and camera of the images that can be measured, and their gains without drift."""
+    gains = _measured(data, most=None)
+    return None if gains is None else ([view.indices for view in gains.views], without_drift(gains))
 
 
 def _times(views: Sequence[View]) -> dict[int, list[float]]:

@@ -188,18 +188,25 @@ class CameraPosesSettings(EffectSettings):
 
     def build(self, data: TrainingData, finding: Finding, generator: torch.Generator) -> "CameraPoses":
         """Corrections start where poses lie on smooth paths, if rays of points meet better from there; else at zero."""
-        views, noise = data.views, self.threshold if finding.value is None else finding.value
+        views = data.views
         poses = torch.stack([view.camera.camera_from_world for view in views])
         recorded = RecordedPoses([view.indices for view in views], [view.time for view in views], poses)
+        said = self.threshold, finding.value
+        start, noise = data.log.kept.get("poses", said, lambda: self._start(data, finding, recorded))
+        focal = torch.stack([view.camera.intrinsics[0, 0] for view in views])
+        return CameraPoses(self, recorded, start.float(), max(noise, _LEAST) / focal)
+
+    def _start(
+        self, data: TrainingData, finding: Finding, recorded: RecordedPoses
+    ) -> tuple[Float64[Tensor, "n 6"], float]:
+        """The corrections to start from, and the error that poses are taken to have there, pixels."""
+        views, noise = data.views, self.threshold if finding.value is None else finding.value
         start = recorded.to_smooth_paths()
         smooth = [replace(view, camera=_moved(view.camera, each)) for view, each in zip(views, start, strict=True)]
         found = None if finding.value is None else pose_noise(seen_from(data.frames, smooth), _moving(data))
         if found is None or found.value > _CONFIRMED * noise:
-            start = torch.zeros_like(start)
-        else:
-            noise = _LEFT * noise
-        focal = torch.stack([view.camera.intrinsics[0, 0] for view in views])
-        return CameraPoses(self, recorded, start.float(), max(noise, _LEAST) / focal)
+            return torch.zeros_like(start), noise
+        return start, _LEFT * noise
 
     def restore(self, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> "CameraPoses":
         indices = [(frame, camera) for frame, camera in tensors["indices"].tolist()]

@@ -11,8 +11,17 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from sparsestreet.data.lidar import visible_pixels
+from sparsestreet.geometry.boxes import without_frames
 from sparsestreet.geometry.cameras import project
-from sparsestreet.scene.initialize.gaussians import MINIMUM_SCALE, Points, at_most, fit_planes, outside_boxes, thinned
+from sparsestreet.scene.initialize.gaussians import (
+    MINIMUM_SCALE,
+    Points,
+    at_most,
+    fit_planes,
+    lidar_in_boxes,
+    outside_boxes,
+    thinned,
+)
 from sparsestreet.scene.initialize.training_data import Coverage, TrainingData, beyond_lidar
 from sparsestreet.triangulation import TriangulatedPoints
 from sparsestreet.types import Frame, Track, View
@@ -328,6 +337,12 @@ class ImagePoints(PointSource):
 def points_from_images(track: Track, data: TrainingData) -> Points:
     """Return the triangulated points inside the track's box, in its frame; none if the run makes none."""
     return Points.concatenate([] if data.image_points is None else [_points_of(data.image_points.in_boxes[track.name])])
+
+
+def returns_in_boxes(tracks: Sequence[Track], data: TrainingData) -> list[Points]:
+    """Return ``lidar_in_boxes`` of the training part of a log."""
+    boxes = without_frames(tracks, data.held_out)
+    return data.log.kept.get("boxes", boxes, lambda: lidar_in_boxes(boxes, data.sweeps), Points)
 
 
 def _points_of(found: TriangulatedPoints) -> Points:

@@ -11,7 +11,7 @@ from torch import Tensor
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_generator
-from sparsestreet.scene.initialize.gaussians import lie_flat, neighbor_scales, outside_swept_boxes
+from sparsestreet.scene.initialize.gaussians import Points, lie_flat, neighbor_scales, outside_swept_boxes
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import Coverage, TrainingData, coverage
 from sparsestreet.scene.masks import Mask
@@ -81,6 +81,11 @@ class BackgroundSettings(NodeSettings):
 
     def seeds(self, data: TrainingData, generator: torch.Generator) -> Seeds:
         """Return the points of the sources. Raises ValueError if there is not a single point."""
+        asked = self.sources, self.num_points, self.clear_swept_boxes
+        said = asked, generator.initial_seed(), data.moving, data.image_points
+        return data.log.kept.get("seeds", said, lambda: self._drawn(data, generator), Seeds, Points)
+
+    def _drawn(self, data: TrainingData, generator: torch.Generator) -> Seeds:
         shared = any(source.number is None for source in self.sources.values())
         seen = coverage(data) if shared else Coverage(0.0, 0.0)  # of which nobody asks for a share
         drawn = {

@@ -12,14 +12,14 @@ from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.boxes import view_lag, without_frames
+from sparsestreet.geometry.boxes import view_lag
 from sparsestreet.geometry.skeleton import NUM_JOINTS, Bones, posed_bones, skin
 from sparsestreet.geometry.trajectories import Trajectories, keyframe_interval
 from sparsestreet.ops.raw import Poses, RawGaussians
 from sparsestreet.scene.body import Anatomy, Body, BodyTemplate, BuiltinBody, People, people_of, surface, trained_poses
 from sparsestreet.scene.gaussians import Rows
-from sparsestreet.scene.initialize.gaussians import Points, lidar_in_boxes
-from sparsestreet.scene.initialize.sources import points_from_images
+from sparsestreet.scene.initialize.gaussians import Points
+from sparsestreet.scene.initialize.sources import points_from_images, returns_in_boxes
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.masks import Mask, MaskScope
 from sparsestreet.scene.nodes.node import BYTES_PER_NUMBER, excess_volume
@@ -147,7 +147,7 @@ def _colors(tracks: Sequence[Track], data: TrainingData, places: Float[Tensor, "
     Measured points are returns and points from images, pooled over all frames; limbs swing about their mean places.
     """
     colors = []
-    pooled = lidar_in_boxes(without_frames(tracks, data.held_out), data.sweeps)
+    pooled = returns_in_boxes(tracks, data)
     for track, returns, vertices in zip(tracks, pooled, places, strict=True):
         measured = Points.concatenate([returns, points_from_images(track, data)])
         if len(measured) == 0:

@@ -11,15 +11,15 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor, nn
 
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.geometry.boxes import view_lag, without_frames
+from sparsestreet.geometry.boxes import view_lag
 from sparsestreet.geometry.trajectories import Trajectories, smoothed
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
 from sparsestreet.scene.density import outside_boxes
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.generators import named_generator
-from sparsestreet.scene.initialize.gaussians import Points, box_surface_points, lidar_in_boxes, neighbor_scales
-from sparsestreet.scene.initialize.sources import points_from_images
+from sparsestreet.scene.initialize.gaussians import Points, box_surface_points, neighbor_scales
+from sparsestreet.scene.initialize.sources import points_from_images, returns_in_boxes
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, usual_track_rates
 from sparsestreet.scene.masks import Mask, MaskScope
@@ -75,7 +75,7 @@ class TrackedSettings(NodeSettings):
         tracks = [track for track in data.tracks if any(int(frame) not in data.held_out for frame in track.frames)]
         if not tracks:
             return None
-        measured = lidar_in_boxes(without_frames(tracks, data.held_out), data.sweeps)
+        measured = returns_in_boxes(tracks, data)
         objects = [
             self._object_points(track, Points.concatenate([points_from_images(track, data), returns]), generator)
             for track, returns in zip(tracks, measured, strict=True)

@@ -16,6 +16,7 @@ from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.lidar import visible_pixels
 from sparsestreet.geometry.boxes import CarriedPoints, box_at, inside_box
 from sparsestreet.geometry.cameras import inverse, project, transform_points
+from sparsestreet.kept import Kept
 from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.gaussians import at_most, outside_boxes, returns_in_box_frame
 from sparsestreet.types import Camera, Frame, Sweep, Track, View
@@ -366,6 +367,32 @@ def collect(
         carried[sweep.index] = replace(points, points=sweep.points[on], tracks=rigid)
         objects[sweep.index] = Returns(carried[sweep.index].points, colors.at(on), torch.ones(len(on)))
     return StreetReturns(Returns.concatenate(street), sweeps.indices, tuple(starts), objects, tuple(moving), carried)
+
+
+def kept_returns(
+    kept: Kept,
+    sweeps: Sweeps,
+    frames: Frames,
+    moving: Sequence[Track],
+    rigid: Sequence[Track],
+    settings: MovedViews,
+    seed: int,
+    gain: Gain,
+) -> StreetReturns:
+    """Return those of ``collect``, with its arguments; from an earlier run on the same log, if one kept them."""
+
+    def collected() -> StreetReturns:
+        found = collect(sweeps, frames, moving, rigid, settings, seed, gain)
+        return replace(found, moving=(), carried=_by(found.carried, ()))
+
+    said = moving, rigid, settings, seed, torch.stack([gain(view) for view in frames.views])
+    found = kept.get("returns", said, collected, StreetReturns, Returns, Colors, CarriedPoints)
+    return replace(found, moving=tuple(moving), carried=_by(found.carried, rigid))
+
+
+def _by(carried: Mapping[int, CarriedPoints], tracks: Sequence[Track]) -> dict[int, CarriedPoints]:
+    """The points, carried by these objects."""
+    return {frame: replace(points, tracks=tracks) for frame, points in carried.items()}
 
 
 def _by_instant(frames: Frames) -> dict[int, list[int]]:

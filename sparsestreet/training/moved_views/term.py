@@ -18,7 +18,7 @@ from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import NodeSettings, RigidSettings
 from sparsestreet.scene.rendering import SceneRendering, from_another_camera
-from sparsestreet.training.moved_views.returns import NEAREST, MovedViews, StreetReturns, collect, target
+from sparsestreet.training.moved_views.returns import NEAREST, MovedViews, StreetReturns, kept_returns, target
 from sparsestreet.types import Camera, Frame, View
 
 _log = logging.getLogger(__name__)
@@ -148,14 +148,14 @@ def moved_view_term(
     moving = [track for track in log.tracks if track.name in taken or displacement(track) > MOVES]
     moving, rigid = without_frames(moving, held_out), without_frames(rigid, held_out)
     with stage("points"), torch.no_grad():
-        returns = collect(sweeps, data.split.train, moving, rigid, settings, seed, scene.gain)
+        returns = kept_returns(log.kept, sweeps, data.split.train, moving, rigid, settings, seed, scene.gain)
     _log.info(
         "views beside the path: %s returns of the street, of mean weight %.2f (1: an image before or after shows the "
         "same color)",
         f"{len(returns.street):,}",
         returns.agreement(),
     )
-    report_shift(edge_shift(data.split.train, sweeps))
+    report_shift(log.kept.get("edges", (), lambda: edge_shift(data.split.train, sweeps), EdgeShift))
     return MovedViewTerm(settings, returns, seed)
 
 
