@@ -38,6 +38,7 @@ from sparsestreet.records.summary import (
 )
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.standing import StandingScene
 from sparsestreet.types import Frame, View
 
 
@@ -270,7 +271,7 @@ class ExtraMetrics:
     ) -> None:
         """Measure over the held-out views (the training views where there are none), record in ``out/records`` and say
         it; nothing where nothing is asked."""
-        views = data.split.held_out or data.split.train
+        scene, views = StandingScene.of(scene), data.split.held_out or data.split.train
         if self.novel:
             with stage("novel"):
                 record = self._beside(scene, views, options, data.driving_log.truth, command)
