@@ -76,7 +76,7 @@ def evaluate_novel(
         raise ValueError(f"novel views need recorded ones and offsets above 0 m, got {len(frames)} and {list(offsets)}")
     if len(frames) < 2:
         extractor, absent = None, "distances need at least two images: hold out more views"
-    device = scene.device
+    scene, device = StandingScene.of(scene), scene.device
     # One process measures: the others wait for nobody.
     distances = None if extractor is None else SetDistances(extractor, sync_on_compute=False)
     quality = Psnr(("full", "human", "vehicle"), sync_on_compute=False)
@@ -174,7 +174,7 @@ def evaluate_presets(
     """
     if not frames or not presets:
         raise ValueError(f"give views and at least one preset, got {len(frames)} and {list(presets)}")
-    before = calibrate(scene.device)
+    scene, before = StandingScene.of(scene), calibrate(scene.device)
     ways = {name: replace(options, backend=trained.backend) for name, options in presets.items()}
     quality, distances = _looks(scene, frames, ways, replace(trained, settings=_exact(trained.settings)))
     times = _frame_times(scene, frames.views, ways)
@@ -271,7 +271,7 @@ class ExtraMetrics:
     ) -> None:
         """Measure over the held-out views (the training views where there are none), record in ``out/records`` and say
         it; nothing where nothing is asked."""
-        scene, views = StandingScene.of(scene), data.split.held_out or data.split.train
+        views = data.split.held_out or data.split.train
         if self.novel:
             with stage("novel"):
                 record = self._beside(scene, views, options, data.driving_log.truth, command)

@@ -169,7 +169,7 @@ def test_it_is_shown_and_not_trained():
     stands = StandingScene.of(street())
     with pytest.raises(ValueError, match="shown and not trained, got gradients"):
         stands.gaussians_at(view(0.0))
-    with torch.no_grad(), pytest.raises(ValueError, match="not trained, got SceneState.*training=True"):
+    with torch.no_grad(), pytest.raises(ValueError, match=r"not trained, got SceneState.*training=True"):
         stands.gaussians_at(view(0.0), replace(FINISHED, training=True))
     with torch.no_grad(), pytest.raises(ValueError, match="sh_degree=1"):
         stands.gaussians_at(view(0.0), SceneState(sh_degree=1))
