@@ -32,7 +32,7 @@ _COSINES = 4
 
 @dataclass(frozen=True)
 class Use:
-    """Of the machine's processors up to one moment, seconds."""
+    """Seconds of the machine's processors up to one moment."""
 
     clock: float
     waited: float
@@ -42,7 +42,7 @@ class Use:
 
     @staticmethod
     def now() -> "Use | None":
-        """As the system says; None where it does not (not Linux)."""
+        """Read what the system counts; None where it does not (not Linux)."""
         try:
             waited = float(_WAITS.read_text().split()[1]) * 1e-9
             ticks = [float(value) for value in _TICKS.read_text().split("\n", 1)[0].split()[1:9]]

@@ -97,7 +97,7 @@ class _KeptRows:
         self._head = 0
 
     def joined(self, still: Sequence[RawGaussians], others: Sequence[RawGaussians], sh_degree: int) -> Gaussians:
-        """As ``ops.activate`` of all parts: views of the table."""
+        """Activate all parts as ``ops.activate`` does, into the table; the answer is views of it."""
         count = sum(map(len, (*still, *others)))
         terms = max(part.terms(sh_degree) for part in (*still, *others))
         # Outside of inference mode, whose tensors could not be written to in a later frame.
