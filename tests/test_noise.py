@@ -1,10 +1,12 @@
 """The calibration loop, and what it says of a machine."""
 
+import os
+
 import pytest
 import torch
 
 from sparsestreet import noise
-from sparsestreet.noise import Calibration, calibrate, noise_between
+from sparsestreet.noise import Calibration, Use, calibrate, noise_between
 
 
 def test_the_loop_is_timed_by_its_rounds(monkeypatch):
@@ -52,3 +54,33 @@ def test_quiet_is_little_spread_and_little_drift(before, after, drift, quiet):
     assert (found.before, found.after, found.load_average) == (before.spread, after.spread, 0.5)
     assert found.drift == pytest.approx(drift)
     assert found.quiet is quiet
+
+
+@pytest.mark.parametrize(
+    ("waited", "others", "quiet"),
+    [
+        (0.5, 1.5, False),
+        (0.0, 1.5, True),  # there are processors enough for all
+        (0.5, 0.0, True),  # its own threads are more than the processors
+    ],
+)
+def test_a_machine_that_others_use_is_not_quiet_though_the_loop_fell_between_their_turns(waited, others, quiet):
+    before = Calibration(2.0, 0.01, 0.5, Use(100.0, 7.0, 50.0))
+    after = Calibration(2.0, 0.01, 0.5, Use(110.0, 7.0 + 10 * waited, 50.0 + 10 * others))
+    found = noise_between(before, after)
+    assert (found.waited, found.others, found.quiet) == (pytest.approx(waited), pytest.approx(others), quiet)
+
+
+def test_use_is_read_from_what_the_system_counts(monkeypatch, tmp_path):
+    """The guest's time, the ninth and tenth number, is part of the user's."""
+    (tmp_path / "waits").write_text("9000000000 2500000000 17\n")
+    (tmp_path / "ticks").write_text("cpu  100 20 30 9999 888 4 5 6 70 80\ncpu0 1 2 3 4 5 6 7 8 9 10\n")
+    monkeypatch.setattr(noise, "_WAITS", tmp_path / "waits")
+    monkeypatch.setattr(noise, "_TICKS", tmp_path / "ticks")
+    monkeypatch.setattr(os, "sysconf", lambda name: 10)
+    monkeypatch.setattr(os, "times", lambda: os.times_result((1.0, 2.0, 0.25, 0.5, 99.0)))
+    found = Use.now()
+    assert found is not None
+    assert (found.waited, found.others) == (2.5, 16.5 - 3.75)
+    (tmp_path / "ticks").unlink()
+    assert Use.now() is None

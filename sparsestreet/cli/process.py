@@ -7,15 +7,22 @@ import ctypes
 import logging
 import os
 import select
+import statistics
 import sys
+import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 _TRIM_THRESHOLD, _MMAP_MAX = -1, -4
 """Of glibc's mallopt (malloc.h)."""
 
-SPINS = "10000"
-"""Looks at a barrier before a thread of libgomp sleeps there, some tens of microseconds."""
+SPINS, BUSY_SPINS = "10000", "0"
+"""Looks at a barrier before a thread of libgomp sleeps there, some hundreds of microseconds at most; and those where
+others need the processors."""
+_RUNNING = Path("/proc/loadavg")
+_SAMPLES, _PAUSE = 9, 0.005
+"""How often, and seconds apart, the system is asked who runs: a process that starts beside ours is no load."""
 
 
 def prepare_process() -> None:
@@ -56,13 +63,33 @@ def keep_freed_memory() -> None:
 
 
 def use_passive_wait() -> None:
-    """Let threads that wait for each other sleep after a moment.
+    """Let threads that wait for each other sleep after a moment, or at once where other processes run.
 
-    By default libgomp's threads look at a barrier a hundred thousands of times, for milliseconds. Where another process
-    has the processor that the other thread needs, they only keep it from running.
+    By default libgomp's threads look at a barrier hundreds of thousands of times, for milliseconds. Where another
+    process has the processor that the other thread needs, they only keep it from running: a step of two threads took
+    seven times the processor's time, a third more with ``SPINS``, and as much as of one thread with ``BUSY_SPINS``
+    (docs/scaling.md).
     """
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", SPINS)
+    if "OMP_WAIT_POLICY" not in os.environ and "GOMP_SPINCOUNT" not in os.environ:
+        os.environ["GOMP_SPINCOUNT"] = SPINS if _processors_do() else BUSY_SPINS
+
+
+def _processors_do() -> bool:
+    """Whether there are processors for our threads beside what runs now; True where the system does not say."""
+    given = os.environ.get("OMP_NUM_THREADS", "")
+    processors = os.cpu_count() or 1
+    threads = int(given) if given.isdecimal() else processors
+    try:
+        others = [_others_running() for _ in range(_SAMPLES)]
+    except (OSError, IndexError, ValueError):
+        return True
+    return threads == 1 or statistics.median(others) + threads <= processors
+
+
+def _others_running() -> int:
+    """Threads of other processes that run or wait for a processor, after a pause."""
+    time.sleep(_PAUSE)
+    return int(_RUNNING.read_text().split()[3].partition("/")[0]) - 1
 
 
 def shares_a_run(trainer: Mapping[str, Any]) -> bool:

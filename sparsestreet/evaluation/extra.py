@@ -38,6 +38,7 @@ from sparsestreet.records.summary import (
 )
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.scene.standing import StandingScene
 from sparsestreet.types import Frame, View
 
 
@@ -75,7 +76,7 @@ def evaluate_novel(
         raise ValueError(f"novel views need recorded ones and offsets above 0 m, got {len(frames)} and {list(offsets)}")
     if len(frames) < 2:
         extractor, absent = None, "distances need at least two images: hold out more views"
-    device = scene.device
+    scene, device = StandingScene.of(scene), scene.device
     # One process measures: the others wait for nobody.
     distances = None if extractor is None else SetDistances(extractor, sync_on_compute=False)
     quality = Psnr(("full", "human", "vehicle"), sync_on_compute=False)
@@ -173,7 +174,7 @@ def evaluate_presets(
     """
     if not frames or not presets:
         raise ValueError(f"give views and at least one preset, got {len(frames)} and {list(presets)}")
-    before = calibrate(scene.device)
+    scene, before = StandingScene.of(scene), calibrate(scene.device)
     ways = {name: replace(options, backend=trained.backend) for name, options in presets.items()}
     quality, distances = _looks(scene, frames, ways, replace(trained, settings=_exact(trained.settings)))
     times = _frame_times(scene, frames.views, ways)

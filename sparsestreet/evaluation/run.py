@@ -40,6 +40,7 @@ from sparsestreet.records.summary import (
 )
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, node_legend, project_centers
+from sparsestreet.scene.standing import StandingScene
 from sparsestreet.types import Frame, View
 
 MAX_IMAGES = 60
@@ -119,7 +120,7 @@ def evaluate_scene(
     splits = _splits(held_out, training)
     if not splits:
         raise ValueError(f"there is no view to evaluate {run.label} on: give held-out views, training views or both")
-    scene = scene.to(torch.device(device)).eval()
+    scene = StandingScene.of(scene.to(torch.device(device)).eval())
     main, frames = next(iter(splits.items()))
     for split in (HELD_OUT, TRAINING):
         Predictions.of(out, split).clear()
@@ -160,7 +161,7 @@ def help_to_evaluate(
     timed, so that nobody else computes then. Raises as ``evaluate_scene``."""
     splits = _splits(held_out, training)
     if splits:
-        _looks(scene.to(torch.device(device)).eval(), splits, options, out, ranks)
+        _looks(StandingScene.of(scene.to(torch.device(device)).eval()), splits, options, out, ranks)
 
 
 def _splits(held_out: Frames | tuple[Frame, ...], training: Frames | tuple[Frame, ...]) -> dict[str, Frames]:

@@ -45,7 +45,7 @@ RUN_FORMAT = 2
 
 @dataclass(frozen=True)
 class Noise:
-    """How steady the machine was during a timing, measured by a fixed loop before and after it."""
+    """How steady the machine was during a timing: a fixed loop before and after it, and who used the processors."""
 
     before: float
     """Ninth minus first decile of the loop's times, relative to their median."""
@@ -55,7 +55,12 @@ class Noise:
     load_average: float | None
     """Average number of processes that wanted to run in the last minute; None if the system does not say."""
     quiet: bool
-    """Whether spreads and drift were small enough to trust medians to 5 % (``noise.QUIET_SPREAD``)."""
+    """Whether spreads, drift and waits were small enough to trust medians to 5 % (``noise.QUIET_SPREAD``)."""
+    waited: float | None = None
+    """Part of the time in which the main thread was ready to run and had no processor; None: the record is older, or
+    the system does not say."""
+    others: float | None = None
+    """Processors that other processes used meanwhile, on average."""
 
 
 @dataclass(frozen=True)

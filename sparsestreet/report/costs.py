@@ -75,7 +75,9 @@ def what_effects_cost(variants: Sequence[Variant]) -> Grid:
         "measured: frames and PSNR of the finished scene with the effect, less those without it; a scene that was "
         "trained without the effect would have made up for a part"
     ]
-    busy = [variant.name for variant in variants if _busy([COSTS.find(record.folder) for record in variant.records])]
+    busy = [
+        variant.name for variant in variants if timed_busy([COSTS.find(record.folder) for record in variant.records])
+    ]
     notes += busy_words(", ".join(busy))
     return Grid("effects", "What each effect costs and brings", _HEADER, tuple(rows), tuple(notes))
 
@@ -118,14 +120,14 @@ def _cells(name: str, found: Sequence[EffectDecision], costs: Sequence[CostRecor
         ABSENT if value is None else f"{value:.3g} {first.unit}",
         ABSENT if first.threshold is None else f"{first.threshold:g}",
         _text([one.ms for one in found], "{:.2f}"),
-        f"{_text(measured, '{:.2f}')} {BUSY if _busy(costs) and any(measured) else ''}".rstrip(),
+        f"{_text(measured, '{:.2f}')} {BUSY if timed_busy(costs) and any(measured) else ''}".rstrip(),
         _text([4e-6 * one.numbers for one in found], "{:.3g}"),
         _text([one.gain for one in found], "{:+.2f}"),
         *(_text([gain and getattr(gain, of) for gain in gains], "{:+.2f}") for of in ("full", "vehicle", "human")),
     ]
 
 
-def _busy(costs: Sequence[CostRecord | None]) -> bool:
+def timed_busy(costs: Sequence[CostRecord | None]) -> bool:
     """Return whether a machine was not quiet while frames were timed with and without each effect."""
     return any(cost is not None and cost.noise is not None and not cost.noise.quiet for cost in costs)
 

@@ -27,7 +27,8 @@ from sparsestreet.records.costs import COSTS
 from sparsestreet.records.curves import LEDGER
 from sparsestreet.records.summary import HELD_OUT
 from sparsestreet.report.collect import by_scene
-from sparsestreet.report.costs import curves_of, curves_of_runs, mean_curve
+from sparsestreet.report.costs import curves_of, curves_of_runs, mean_curve, timed_busy
+from sparsestreet.report.tables import BUSY
 from sparsestreet.report.variants import Variant, plain_of
 
 T = TypeVar("T")
@@ -66,6 +67,13 @@ PARETO_COSTS = (
     ("training", "training minutes", "train minutes"),
 )
 """Name, axis label and column of each cost that quality is drawn against."""
+_CLOCK_OF = {"ms/frame": "frames", "train minutes": "training"}
+"""Column of times -> what its machine was measured with."""
+
+
+def _axis_of_times(label: str, busy: bool) -> str:
+    """Return the label of an axis with the mark of times, if any that it shows is of a machine that was not quiet."""
+    return f"{label} {BUSY}" if busy else label
 
 
 def panels(columns: int, width: float = 3.2, height: float = 3.4) -> tuple[Figure, list[Axes]]:
@@ -222,7 +230,8 @@ def pareto(variants: Sequence[Variant], protocol: Protocol, cost: tuple[str, str
     for index, (one, (name, value)) in enumerate(zip(axes, regions.items(), strict=True)):
         says |= _pareto_panel(one, variants, cost, value, name)
         one.set_title(name, fontsize=10)
-        one.set_xlabel(cost[1])
+        clock = _CLOCK_OF.get(cost[2])
+        one.set_xlabel(_axis_of_times(cost[1], any(variant.busy(clock) for variant in variants if clock)))
         if index == 0:
             one.set_ylabel("held-out PSNR, dB")
     legend_below(figure, _legend(variants))
@@ -359,7 +368,8 @@ def held_out_over_time(variants: Sequence[Variant], path: Path) -> bool:
             looks = zip(curve.seconds, curve.psnr, strict=True)
             says[name] = [f"{variant.name}: {psnr:.3f} dB after {at:.1f} s" for at, psnr in looks]
 
-    return _over_time(variants, drawn, draw, ("training seconds", "held-out PSNR, dB"), path, says)
+    seconds = _axis_of_times("training seconds", any(variant.busy("training") for variant in drawn))
+    return _over_time(variants, drawn, draw, (seconds, "held-out PSNR, dB"), path, says)
 
 
 def counts_over_time(variants: Sequence[Variant], path: Path) -> bool:
@@ -435,7 +445,8 @@ def frame_waterfall(variants: Sequence[Variant], path: Path) -> bool:
     axes.set_yticks(range(len(drawn)), ["\n".join(lines) for lines in titles])
     axes.invert_yaxis()
     axes.axvline(0, color=GREY, linewidth=0.8)
-    axes.set_xlabel("milliseconds that a frame takes longer with it")
+    records = [COSTS.find(record.folder) for variant in drawn for record in variant.records]
+    axes.set_xlabel(_axis_of_times("milliseconds that a frame takes longer with it", timed_busy(records)))
     figure.legend(loc="outside lower center", ncols=5, **LEGEND)
     write_svg(figure, path)
     return True

@@ -15,7 +15,17 @@ from sparsestreet.records.configuration import Setting, config_hash, differing_o
 from sparsestreet.records.run import CodeVersion, Machine
 from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
 from sparsestreet.report.collect import UNIT, RunRecord, by_scene, by_unit, check_definitions, of_runs, summary_frame
-from sparsestreet.report.tables import ABSENT, BUSY, CAPPED, Quantity, Spread, busy_note, markdown_lines, spread
+from sparsestreet.report.tables import (
+    ABSENT,
+    BUSY,
+    CAPPED,
+    LEFT_OUT,
+    Quantity,
+    Spread,
+    busy_note,
+    markdown_lines,
+    spread,
+)
 from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
 
 
@@ -557,10 +567,10 @@ def _lines(section: Section) -> list[list[str]]:
 def _cell(cell: Spread | None, quantity: Quantity, busy: bool, row: Row) -> str:
     """Return mean ± sd, marks of a count that a cap limited and of a time of a busy machine, and n if it differs.
 
-    A difference holds no time of a busy machine: it has the mark alone where nothing else is left.
+    A difference holds no time of a busy machine: a dash has the mark where nothing else is left.
     """
     if cell is None:
-        return BUSY if busy else ABSENT
+        return LEFT_OUT if busy else ABSENT
     percentage = row.difference and quantity.relative
     number = ("{:.1f}" if percentage else quantity.text).format
     sign = "" if not row.difference or percentage else "+" if cell.mean >= 0 else "-"

@@ -210,6 +210,8 @@ CAPPED = "†"
 """Marks counts that a node's ``max_gaussians`` limited."""
 BUSY = "§"
 """Marks times that are of a machine that was not quiet, as the ``noise`` of their record says."""
+LEFT_OUT = f"{ABSENT} {BUSY}"
+"""In the place of a difference or ratio of times of which one has that mark."""
 
 
 def frames_steady(run: RunSummary) -> bool:

@@ -9,7 +9,7 @@ import pandas as pd
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.summary import HELD_OUT
 from sparsestreet.report.collect import by_scene, mean_over_scenes
-from sparsestreet.report.tables import BUSY, CAPPED, CONFIDENCE, Cell, Grid, Quantity, Spread, number_cell, spread
+from sparsestreet.report.tables import CAPPED, CONFIDENCE, LEFT_OUT, Cell, Grid, Quantity, Spread, number_cell, spread
 from sparsestreet.report.variants import Variant, busy_variants, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
@@ -67,7 +67,7 @@ def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
         found = [paired(variant, plain, one.column, one.relative, one.clock) for one in shown]
         n = max((gain.n for gain in found if gain), default=0)
         cells = [
-            Cell(BUSY, runs=runs)
+            Cell(LEFT_OUT, runs=runs)
             if gain is None and one.clock and (variant.busy(one.clock) or plain.busy(one.clock))
             else difference_cell(gain, one.text, n, runs)
             for gain, one in zip(found, shown, strict=True)

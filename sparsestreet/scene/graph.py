@@ -1,7 +1,7 @@
 """The scene graph: nodes and effects by name, one list of Gaussians in a view."""
 
 import copy
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -70,10 +70,13 @@ class SceneGraph(nn.Module):
         for name, part in parts.items():
             spans[name] = slice(start, start + len(part))
             start += len(part)
-        gaussians = activate(list(parts.values()), sh_degree=state.sh_degree)
+        gaussians = self._activated(list(parts.values()), state)
         if view.camera.shutter is not None and view.camera.shutter.span > 0:
             gaussians = replace(gaussians, displacements=self.displacements(view, parts, view.camera.shutter.span))
         return SceneGaussians(gaussians, spans, parts, view, self._gates(state) if state.training else None)
+
+    def _activated(self, parts: Sequence[RawGaussians], state: SceneState) -> Gaussians:
+        return activate(parts, sh_degree=state.sh_degree)
 
     def exposed(self, view: View) -> Exposed | None:
         """What the view gathers its light over, by the effects; None: nothing blurs it."""
@@ -150,11 +153,14 @@ class SceneGraph(nn.Module):
             known = ", ".join([*self.nodes, *self.effects])
             raise ValueError(f"the scene has no node or effect {name!r} to leave out: choose one of {known}")
         effects = dict(self.effects.items()) | {name: self.effects[name].settings.left_out()}
-        return SceneGraph(dict(self.nodes.items()), {key: one for key, one in effects.items() if one is not None})
+        return self._like(dict(self.nodes.items()), {key: one for key, one in effects.items() if one is not None})
 
     def with_nodes(self, nodes: Mapping[str, Node]) -> "SceneGraph":
         """Other nodes seen through the same effects."""
-        return SceneGraph(nodes, dict(self.effects.items()))
+        return self._like(nodes, dict(self.effects.items()))
+
+    def _like(self, nodes: Mapping[str, Node], effects: Mapping[str, Effect]) -> "SceneGraph":
+        return SceneGraph(nodes, effects)
 
 
 def _emptied(node: Node) -> Node:

@@ -9,7 +9,7 @@ import importlib
 import math
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import torch
@@ -22,6 +22,7 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.masks import BakedMaskSettings
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, render
+from sparsestreet.scene.standing import StandingScene
 from sparsestreet.types import View
 
 CLASS = "class"
@@ -129,6 +130,10 @@ class StoredScene:
     def render(self, view: View) -> SceneRendering:
         """The image of any view, without gradients."""
         return render(self.scene, view, options=self.options)
+
+    def standing(self) -> "StoredScene":
+        """The same for many frames: what stands still is activated once (``scene.standing.StandingScene``)."""
+        return replace(self, scene=StandingScene.of(self.scene))
 
 
 def description(stored: StoredScene) -> dict[str, Any]:

@@ -16,9 +16,9 @@ from sparsestreet.records.run import RUN
 from sparsestreet.scene.edits import Change, Edits, Given, edited, objects_of
 from sparsestreet.scene.edits.edits import found
 from sparsestreet.scene.effects.optics import GlobalShutter, Pinhole
-from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.rendering import render
+from sparsestreet.scene.standing import StandingScene
 from sparsestreet.scene.storage import SCENE_FILE as SCENE_FILE
 from sparsestreet.scene.storage import STREET_FILE, StoredScene, rig_record, scene_path, views_of
 from sparsestreet.scene.views import VIEWS_FILE as VIEWS_FILE
@@ -58,7 +58,7 @@ def open_run(run: Path, name: str, open_scene: Open, options: RigOptions) -> Ser
     """
     stored = open_scene(run)
     effects = {key: one for key, one in stored.scene.effects.items() if not isinstance(one, Pinhole | GlobalShutter)}
-    scene = SceneGraph(dict(stored.scene.nodes.items()), effects).eval()
+    scene = StandingScene(dict(stored.scene.nodes.items()), effects).eval()
     return ServedScene(name, replace(stored, scene=scene), run_rig(run, options))
 
 

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,27 +15,51 @@ import torch
 from omegaconf import OmegaConf
 
 from sparsestreet.atomic import acquire_lock, release_lock
-from sparsestreet.cli import READER_GONE
+from sparsestreet.cli import READER_GONE, process
 from sparsestreet.cli.commands.evaluate import _device
 from sparsestreet.cli.commands.options import run_command
 from sparsestreet.cli.commands.scenes import open_scene
 from sparsestreet.cli.config.validate import device_of, device_problem
-from sparsestreet.cli.process import SPINS, is_worker_rank, name_beside_first, set_log_prefix, use_passive_wait
+from sparsestreet.cli.process import (
+    BUSY_SPINS,
+    SPINS,
+    is_worker_rank,
+    name_beside_first,
+    set_log_prefix,
+    use_passive_wait,
+)
 from sparsestreet.cli.runs import locks as device_module
 from sparsestreet.cli.runs.locks import LOCK, FolderTakenError, devices_of_job, sole_writer
 from tests.evaluation.frames import make_run
 
 
 @pytest.mark.parametrize(
-    ("given", "expected"),
-    [({}, SPINS), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "ACTIVE"}, None)],
+    ("given", "running", "expected"),
+    [
+        ({}, [1] * 9, SPINS),
+        ({}, [2, 1, 3, 1, 1, 2, 1, 1, 2], SPINS),  # some come and go
+        ({}, [2, 1, 3, 1, 2, 2, 1, 1, 2], BUSY_SPINS),
+        ({"OMP_NUM_THREADS": "3"}, [2] * 9, SPINS),  # one processor of four is left
+        ({"OMP_NUM_THREADS": "3"}, [3] * 9, BUSY_SPINS),
+        ({"OMP_NUM_THREADS": "1"}, [9] * 9, SPINS),  # which waits for nobody
+        ({}, [], SPINS),  # a system that does not say
+        ({"GOMP_SPINCOUNT": "7"}, [9] * 9, "7"),
+        ({"OMP_WAIT_POLICY": "ACTIVE"}, [9] * 9, None),
+    ],
 )
-def test_threads_sleep_unless_the_environment_says_otherwise(monkeypatch, given, expected):
-    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+def test_threads_sleep_at_once_where_others_run_unless_the_environment_says_otherwise(
+    monkeypatch, given, running, expected
+):
+    """Of four processors; the system counts this process among those that run."""
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY", "OMP_NUM_THREADS"):
         monkeypatch.setenv(name, "")  # so that whatever is set here is taken back
         monkeypatch.delenv(name)
     for name, value in given.items():
         monkeypatch.setenv(name, value)
+    said = [f"0.50 1.00 2.00 {count}/345 678\n" for count in running]
+    monkeypatch.setattr(process.os, "cpu_count", lambda: 4)
+    monkeypatch.setattr(process.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(process, "_RUNNING", SimpleNamespace(read_text=lambda: said.pop(0)))
     use_passive_wait()
     assert os.environ.get("GOMP_SPINCOUNT") == expected
 

@@ -22,6 +22,7 @@ from sparsestreet.records.costs import COSTS, NodeCost
 from sparsestreet.records.run import RUN
 from sparsestreet.records.summary import HELD_OUT, LATENCY, QUALITY, SUMMARY, TRAINING, clock_rows, summarize
 from sparsestreet.scene.rendering import RenderOptions, node_legend
+from sparsestreet.scene.standing import StandingScene
 from sparsestreet.types import View
 from tests.evaluation.dark import MADE, darker, evaluate, make_frames
 from tests.evaluation.frames import NOISE, make_frame, make_latency
@@ -251,7 +252,7 @@ def test_everything_reaches_its_measurement(tmp_path, monkeypatch):
     """Two sizes and cameras held out, one trained on: each measurement sees the right ones."""
     held_out = [unlike(3, 1, (9, 12)), unlike(5, 2, (12, 9))]
     training = [unlike(4, 1, (10, 11))]
-    scene, device, seen = small_scene(), torch.device("cpu", 0), {}
+    scene, device, seen = StandingScene.of(small_scene()), torch.device("cpu", 0), {}
     latency = dataclasses.replace(make_latency(7.5), device="cpu: somewhere", threads=3)
     costs = SceneCosts({"splat": 1.0}, {"road": NodeCost(1, 2.0, 3.0, 4.0)}, {"sky": 5.0}, NOISE)
     alarming = Guards(**{field.name: place for place, field in enumerate(dataclasses.fields(Guards))})

@@ -33,7 +33,7 @@ from sparsestreet.report.figures import (
 )
 from sparsestreet.report.sweep import _figures
 from sparsestreet.report.variants import variants
-from tests.evaluation.frames import make_summary
+from tests.evaluation.frames import disturbed, make_summary
 from tests.report.sweep_folder import record, write_sweep
 
 
@@ -225,6 +225,20 @@ def test_bars_of_a_frame_lie_behind_each_other(canvas, tmp_path):
     (legend,) = canvas["w.svg"].legends
     assert [text.get_text() for text in legend.get_texts()] == ["road", "cars", "effect: sky"]
     assert [to_hex(one.get_facecolor()) for one in legend.get_patches()] == paint[:3]
+
+
+@pytest.mark.parametrize("clock", ["frames", "training"])
+def test_axes_of_times_carry_the_mark_of_a_machine_that_was_not_quiet(canvas, tmp_path, clock):
+    loud, folder = disturbed(make_summary("a+paper"), clock), tmp_path / "loud"
+    HELD_OUT_CURVE.write(folder, [HeldOutLook(10.0, 9, 20.0, 1.0, 2.0)])
+    update_costs(folder, effects={"sky": 0.5}, noise=loud.latency.noise)
+    found = variants([record(make_summary("a"), str(tmp_path / "calm")), record(loud, str(folder))])
+    for cost in PARETO_COSTS:
+        assert pareto(found, DRIVESTUDIO, cost, tmp_path / f"{cost[0]}.svg")
+    assert held_out_over_time(found, tmp_path / "held_out.svg")
+    assert frame_waterfall(found, tmp_path / "waterfall.svg")
+    marked = {name for name, figure in canvas.items() if figure.axes[0].get_xlabel().endswith(" §")}
+    assert marked == {"frames": {"frame.svg", "waterfall.svg"}, "training": {"training.svg", "held_out.svg"}}[clock]
 
 
 def test_a_curve_is_the_runs_own(canvas, tmp_path):

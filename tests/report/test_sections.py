@@ -274,7 +274,7 @@ def test_a_time_of_a_busy_machine_is_marked_and_compared_with_no_other():
     plain, ours, against = lines[2:]
     assert (plain[ms], plain[seconds]) == ("40.0 ± 0.0", "650 ± 354 § |")
     assert (ours[ms], ours[seconds]) == ("13.0 ± 0.0 §", "100 ± 0 |")
-    assert (against[ms], against[seconds]) == ("§", "25.0 % (n=1) |")
+    assert (against[ms], against[seconds]) == ("- §", "25.0 % (n=1) |")
     said = "§ times of a machine that was not quiet, compared with no other: frames of ours; training of plain"
     assert said in section.notes
     (quiet,) = sections(PLAIN_AND_OURS, "plain")

@@ -191,7 +191,7 @@ def test_a_difference_of_times_is_of_quiet_pairs_alone():
     found = variants([record(run) for run in runs])
     grid = differences(found, DRIVESTUDIO)
     row = by_heading(grid, grid.rows[0])
-    assert (row["ms/frame, %"].text, row["train s, %"].text) == ("-75.0 (n=1)", "§")
+    assert (row["ms/frame, %"].text, row["train s, %"].text) == ("-75.0 (n=1)", "- §")
     assert grid.notes[-1].endswith("frames of plain; training of plain+removal")
     best = matched_quality(found, DRIVESTUDIO)
     assert by_heading(best, best.rows[0])["train minutes"].text.endswith(" §")

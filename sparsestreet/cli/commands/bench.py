@@ -78,12 +78,18 @@ def bench(arguments: list[str]) -> int:
 def _bench(command: str, overrides: list[str], request: BenchRequest) -> None:
     import torch
 
+    from sparsestreet.noise import calibrate, noise_between
+
     if request.threads is not None:
         torch.set_num_threads(request.threads)
+    before = calibrate(torch.device("cpu"))
     if request.mode == "step":
-        return _step(request, overrides, command)
-    file = record_file(request.out, request.mode, command)
-    return {"settings": _settings, "blend": _blend, "costs": _costs, "scaling": _scaling}[request.mode](request, file)
+        _step(request, overrides, command)
+    else:
+        file = record_file(request.out, request.mode, command)
+        {"settings": _settings, "blend": _blend, "costs": _costs, "scaling": _scaling}[request.mode](request, file)
+    if not noise_between(before, calibrate(torch.device("cpu"))).quiet:
+        print("the machine was not quiet: compare these times with no others")
 
 
 def _settings(request: BenchRequest, file: "RecordFile") -> None:

@@ -167,7 +167,7 @@ def _render(request: RenderRequest) -> None:
 
     started = time.perf_counter()
     check_destination(request.out)
-    stored = open_scene(request.scene, request.device, request.parts)
+    stored = open_scene(request.scene, request.device, request.parts).standing()
     views = recorded_views(request.scene, request.views)
     log_fps = request.log_fps or views.frame_rate
     if log_fps is None:

@@ -62,7 +62,7 @@ def _view(request: ViewRequest) -> None:
     from sparsestreet.viewing.server import Viewer
     from sparsestreet.viewing.stage import Stage
 
-    stored = open_scene(request.scene, request.device, request.parts)
+    stored = open_scene(request.scene, request.device, request.parts).standing()
     folder = folder_of(request.scene)
     views = recorded_views(request.scene, request.views)
     file, open_other = request.edits or folder / "edits.yaml", opener(stored)
