@@ -1,0 +1,84 @@
+// A tile's pixels in blocks of 4x4, and which blocks a splat reaches. While a tile is worked on, its pixels lie block by
+// block, so that a block is one AVX-512 register: few of its lanes are outside a splat, where a line of 16 pixels would
+// leave three of four idle.
+#pragma once
+#include "workspace.hpp"
+
+namespace SPLAT_VARIANT {
+
+// Where pixel (x, y) of a tile lies in the tile's arrays.
+inline int place(int x, int y) {
+  return (y / BLOCK * BLOCKS_ACROSS + x / BLOCK) * BLOCK_PIXELS + y % BLOCK * BLOCK + x % BLOCK;
+}
+
+// The centers of a tile's pixels in the image, and of the first pixels of its blocks.
+template <class T>
+struct TilePixels {
+  alignas(64) T x[PIXELS], y[PIXELS];
+  alignas(64) T left[BLOCK_LANES] = {}, top[BLOCK_LANES] = {};
+
+  TilePixels(int64_t x0, int64_t y0) {
+    for (int row = 0; row < TILE; ++row)
+      for (int column = 0; column < TILE; ++column) {
+        x[place(column, row)] = T(x0 + column) + T(0.5), y[place(column, row)] = T(y0 + row) + T(0.5);
+      }
+    for (int block = 0; block < BLOCKS; ++block)
+      left[block] = x[block * BLOCK_PIXELS], top[block] = y[block * BLOCK_PIXELS];
+  }
+};
+
+// Bit i: the ellipse |L d|^2 <= reach meets the square of the pixel centers of block i, made wider by a margin. The least
+// |L d|^2 in a rectangle is at one of its sides that face the mean, or it is 0.
+template <class T>
+inline BlockMask reached_blocks(const Splat<T>& s, const TilePixels<T>& pixels) {
+  constexpr T side = BLOCK - 1;
+  const T reach = s.log2_opacity - s.least_exponent, ratio = s.half_x > 0 ? s.half_y / s.half_x : T(0);
+  const T tilt_x = -s.l21 / s.l11, tilt_y = tilt_x * ratio * ratio;  // of the lines of least |L d|^2 in x and in y
+  const T margin_x = T(BOX_MARGIN) + T(1e-5) * s.half_x, margin_y = T(BOX_MARGIN) + T(1e-5) * s.half_y;
+  BlockMask mask = 0;
+  for (int i = 0; i < BLOCKS; i += LANES<T>) {
+    const Lanes<T> left = load(pixels.left + i) - (s.x + margin_x), right = left + (side + 2 * margin_x);
+    const Lanes<T> top = load(pixels.top + i) - (s.y + margin_y), bottom = top + (side + 2 * margin_y);
+    const Lanes<T> dx = larger(left, smaller(right, Lanes<T>{})), dy = larger(top, smaller(bottom, Lanes<T>{}));
+    const Lanes<T> x = larger(left, smaller(right, tilt_x * dy)), y = larger(top, smaller(bottom, tilt_y * dx));
+    const Lanes<T> a = s.l11 * dx + s.l21 * y, b = s.l22 * y, c = s.l11 * x + s.l21 * dy, d = s.l22 * dy;
+    mask |= BlockMask(bits<T>(smaller(a * a + b * b, c * c + d * d) <= reach)) << i;
+  }
+  return mask & ALL_BLOCKS;
+}
+
+// Calls visit(at) for each register of pixels of the blocks in the mask; at: its place in the tile's arrays.
+template <class T, class Visit>
+inline void for_each_register(BlockMask mask, Visit visit) {
+  for (; mask != 0; mask &= mask - 1) {
+    const int first = __builtin_ctzll(mask) * BLOCK_PIXELS;
+    for (int at = first; at < first + BLOCK_PIXELS; at += LANES<T>) visit(at);
+  }
+}
+
+// Pairs between two looks at which blocks are finished.
+constexpr int64_t LOOK = 16;
+
+// The blocks that a splat is blended in: those that it reaches and that have a pixel whose `state` is above `least`.
+template <class T>
+struct OpenBlocks {
+  const T* state;
+  T least;
+  BlockMask open = ALL_BLOCKS;
+
+  // Of the pair that is the k-th of its tile; called for one after the other.
+  BlockMask of(const Workspace<T>& ws, const Splat<T>& s, const TilePixels<T>& pixels, int64_t k) {
+    if (k % LOOK == 0) look();
+    return ws.bounded ? reached_blocks(s, pixels) & open : open;
+  }
+  void look() {
+    open = 0;
+    for (int block = 0; block < BLOCKS; ++block) {
+      Integers<T> some{};
+      for (int i = 0; i < BLOCK_PIXELS; i += LANES<T>) some |= load(state + block * BLOCK_PIXELS + i) > least;
+      open |= BlockMask(bits<T>(some) != 0) << block;
+    }
+  }
+};
+
+}  // namespace SPLAT_VARIANT
