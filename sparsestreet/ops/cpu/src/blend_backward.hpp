@@ -7,6 +7,7 @@
 #pragma once
 #include <omp.h>
 
+#include "columns.hpp"
 #include "pixel.hpp"
 
 namespace SPLAT_VARIANT {
@@ -18,15 +19,9 @@ struct TileCotangents {
       depth[PIXELS];
 };
 
-// Sums over the registers of a tile, lane by lane.
-template <class T>
-struct LaneSums {
-  Lanes<T> s{}, sa{}, sb{}, sa_dx{}, sa_dy{}, sb_dy{}, abs_x{}, abs_y{}, red{}, green{}, blue{}, depth{}, gate{};
-};
-
 template <class T, bool GATED>
 inline void accumulate_register(const Splat<T>& p, const TilePixels<T>& pixels, const Cuts<T>& cuts,
-                                TileCotangents<T>& t, int at, T pair, LaneSums<T>& sums) {
+                                TileCotangents<T>& t, int at, T pair, Slot<Lanes<T>>& sums, Lanes<T>& gate) {
   const Sample<T> q = sample(p, pixels, at, cuts);
   const Lanes<T> drawn = load(t.last + at) >= pair ? q.alpha : Lanes<T>{};
   const Lanes<T> alpha = GATED ? drawn * p.gate : drawn;
@@ -39,7 +34,7 @@ inline void accumulate_register(const Splat<T>& p, const TilePixels<T>& pixels, 
   store(t.behind + at, behind + blended);
   Lanes<T> s = blended - alpha * inverse * behind;
   s = q.raw <= cuts.alpha_max ? s : Lanes<T>{};  // a clamped alpha has no derivative
-  if (GATED) sums.gate += drawn * (transmittance * light - inverse * behind);
+  if (GATED) gate += drawn * (transmittance * light - inverse * behind);
   const Lanes<T> sa = s * q.a, sb = s * q.b;
   sums.s += s;
   sums.sa += sa;
@@ -49,25 +44,30 @@ inline void accumulate_register(const Splat<T>& p, const TilePixels<T>& pixels, 
   sums.sb_dy += sb * q.dy;
   sums.abs_x += magnitude(sa);
   sums.abs_y += magnitude(p.l21 * sa + p.l22 * sb);
-  sums.red += weight * red;
-  sums.green += weight * green;
-  sums.blue += weight * blue;
+  sums.color[0] += weight * red;
+  sums.color[1] += weight * green;
+  sums.color[2] += weight * blue;
   sums.depth += weight * depth;
 }
 
 template <class T>
 inline T total(const Lanes<T>& values) {
-  T each[LANES<T>], sum = 0;
-  store(each, values);
-  for (int i = 0; i < LANES<T>; ++i) sum += each[i];
+  T sum = 0;
+  for (int i = 0; i < LANES<T>; ++i) sum += values[i];
   return sum;
 }
 
+// Sums over the lanes.
 template <class T>
-inline Slot<T> totals(const LaneSums<T>& c) {
-  return {total<T>(c.s), total<T>(c.sa), total<T>(c.sb), total<T>(c.sa_dx), total<T>(c.sa_dy), total<T>(c.sb_dy),
-          total<T>(c.abs_x), total<T>(c.abs_y), {total<T>(c.red), total<T>(c.green), total<T>(c.blue)},
-          total<T>(c.depth)};
+inline void store_totals(const Slot<Lanes<T>>& sums, Slot<T>& slot) {
+  const Lanes<T>* columns = &sums.s;
+  for (int c = 0; c < SLOT_COLUMNS<T>; c += LANES<T>) {
+    const int count = SLOT_COLUMNS<T> - c < LANES<T> ? SLOT_COLUMNS<T> - c : LANES<T>;
+    Lanes<T> square[LANES<T>] = {};
+    for (int i = 0; i < count; ++i) square[i] = columns[c + i];
+    const Lanes<T> totals = row_sums<T>(square);
+    __builtin_memcpy(&slot.s + c, &totals, count * sizeof(T));
+  }
 }
 
 // Loads the cotangents, and the light that got past everything.
@@ -102,12 +102,13 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, co
       __builtin_prefetch(&ws.slots[ws.pairs[k - PREFETCH].slot], 1);
     }
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
-    LaneSums<T> sums;
+    Slot<Lanes<T>> sums{};
+    Lanes<T> gate{};
     for_each_register<T>(ws.masks[k], [&](int at) {
-      accumulate_register<T, GATED>(s, pixels, cuts, t, at, T(k - begin), sums);
+      accumulate_register<T, GATED>(s, pixels, cuts, t, at, T(k - begin), sums, gate);
     });
-    ws.slots[ws.pairs[k].slot] = totals(sums);
-    if (GATED) ws.gate_slots[ws.pairs[k].slot] = total<T>(sums.gate);
+    store_totals(sums, ws.slots[ws.pairs[k].slot]);
+    if (GATED) ws.gate_slots[ws.pairs[k].slot] = total<T>(gate);
   }
 }
 
