@@ -55,13 +55,10 @@ template <class T>
 void write_tile(const TileColors<T>& c, const View& view, int64_t x0, int64_t y0, const Layers& image) {
   T *rgb = static_cast<T*>(image.rgb), *transmittance = static_cast<T*>(image.transmittance);
   T* depth = static_cast<T*>(image.depth_sum);
-  for (int64_t y = y0; y < y0 + TILE && y < view.height; ++y) {
-    for (int64_t x = x0; x < x0 + TILE && x < view.width; ++x) {
-      const int64_t from = place(x - x0, y - y0), to = y * view.width + x;
-      rgb[3 * to] = c.red[from], rgb[3 * to + 1] = c.green[from], rgb[3 * to + 2] = c.blue[from];
-      transmittance[to] = c.transmittance[from], depth[to] = c.depth[from];
-    }
-  }
+  for_each_pixel(view, x0, y0, [&](int from, int64_t to) {
+    rgb[3 * to] = c.red[from], rgb[3 * to + 1] = c.green[from], rgb[3 * to + 2] = c.blue[from];
+    transmittance[to] = c.transmittance[from], depth[to] = c.depth[from];
+  });
 }
 
 template <class T, bool EXCLUSIVE, bool GATED>
@@ -76,8 +73,8 @@ void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
     TileColors<T> c;
     std::memset(static_cast<void*>(&c), 0, sizeof(c));
     for (T& pair : c.last) pair = -1;
-    open_tile(c.transmittance, view, x0, y0);
-    if (EXCLUSIVE) open_tile(c.product, view, x0, y0);
+    open_tile(c.transmittance, view, pixels);
+    if (EXCLUSIVE) open_tile(c.product, view, pixels);
     sort_tile(ws, tile);
     ws.tile_end[tile] = blend_tile<T, EXCLUSIVE, GATED>(ws, cuts, tile, pixels, c, samples);
     write_tile(c, view, x0, y0, image);

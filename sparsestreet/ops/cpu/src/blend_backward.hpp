@@ -77,15 +77,12 @@ void load_tile(TileCotangents<T>& t, const View& view, int64_t x0, int64_t y0, c
   std::memset(static_cast<void*>(&t), 0, sizeof(t));
   const T *v_rgb = static_cast<const T*>(cotangents.rgb), *v_depth = static_cast<const T*>(cotangents.depth_sum);
   const T* v_passed = static_cast<const T*>(cotangents.transmittance);
-  for (int64_t y = y0; y < y0 + TILE && y < view.height; ++y) {
-    for (int64_t x = x0; x < x0 + TILE && x < view.width; ++x) {
-      const int64_t to = place(x - x0, y - y0), from = y * view.width + x;
-      t.transmittance[to] = passed[from];
-      if (v_passed) t.behind[to] = passed[from] * v_passed[from];
-      if (v_depth) t.depth[to] = v_depth[from];
-      if (v_rgb) t.red[to] = v_rgb[3 * from], t.green[to] = v_rgb[3 * from + 1], t.blue[to] = v_rgb[3 * from + 2];
-    }
-  }
+  for_each_pixel(view, x0, y0, [&](int to, int64_t from) {
+    t.transmittance[to] = passed[from];
+    if (v_passed) t.behind[to] = passed[from] * v_passed[from];
+    if (v_depth) t.depth[to] = v_depth[from];
+    if (v_rgb) t.red[to] = v_rgb[3 * from], t.green[to] = v_rgb[3 * from + 1], t.blue[to] = v_rgb[3 * from + 2];
+  });
 }
 
 template <class T, bool GATED>

@@ -1,44 +1,49 @@
-// A tile's pixels in blocks of 4x4, and which blocks a splat reaches. While a tile is worked on, its pixels lie block by
-// block, so that a block is one AVX-512 register: few of its lanes are outside a splat, where a line of 16 pixels would
-// leave three of four idle.
+// A tile's pixels in blocks, and which blocks a splat reaches. While a tile is worked on, its pixels lie block by block,
+// so that a register holds pixels that are near each other: in a line of 16, three of four would be outside the splat.
 #pragma once
 #include "workspace.hpp"
 
 namespace SPLAT_VARIANT {
 
-// Where pixel (x, y) of a tile lies in the tile's arrays.
-inline int place(int x, int y) {
-  return (y / BLOCK * BLOCKS_ACROSS + x / BLOCK) * BLOCK_PIXELS + y % BLOCK * BLOCK + x % BLOCK;
+// Column and line, in the tile, of the pixel that lies at a place of the tile's arrays.
+inline int column_of(int at) { return at / BLOCK_PIXELS % BLOCKS_ACROSS * BLOCK_WIDTH + at % BLOCK_WIDTH; }
+inline int line_of(int at) { return at / BLOCK_PIXELS / BLOCKS_ACROSS * BLOCK_HEIGHT + at % BLOCK_PIXELS / BLOCK_WIDTH; }
+
+// Calls visit(at, pixel) for each pixel of a tile that is in the image; pixel: its index there.
+template <class Visit>
+inline void for_each_pixel(const View& view, int64_t x0, int64_t y0, Visit visit) {
+  for (int at = 0; at < PIXELS; ++at) {
+    const int64_t x = x0 + column_of(at), y = y0 + line_of(at);
+    if (x < view.width && y < view.height) visit(at, y * view.width + x);
+  }
 }
 
 // The centers of a tile's pixels in the image, and of the first pixels of its blocks.
 template <class T>
 struct TilePixels {
+  static constexpr int WHOLE_REGISTERS = BLOCKS < LANES<T> ? LANES<T> : BLOCKS;
   alignas(64) T x[PIXELS], y[PIXELS];
-  alignas(64) T left[BLOCK_LANES] = {}, top[BLOCK_LANES] = {};
+  alignas(64) T left[WHOLE_REGISTERS] = {}, top[WHOLE_REGISTERS] = {};
 
   TilePixels(int64_t x0, int64_t y0) {
-    for (int row = 0; row < TILE; ++row)
-      for (int column = 0; column < TILE; ++column) {
-        x[place(column, row)] = T(x0 + column) + T(0.5), y[place(column, row)] = T(y0 + row) + T(0.5);
-      }
+    for (int at = 0; at < PIXELS; ++at)
+      x[at] = T(x0) + (T(column_of(at)) + T(0.5)), y[at] = T(y0) + (T(line_of(at)) + T(0.5));
     for (int block = 0; block < BLOCKS; ++block)
       left[block] = x[block * BLOCK_PIXELS], top[block] = y[block * BLOCK_PIXELS];
   }
 };
 
-// Bit i: the ellipse |L d|^2 <= reach meets the square of the pixel centers of block i, made wider by a margin. The least
-// |L d|^2 in a rectangle is at one of its sides that face the mean, or it is 0.
+// Bit i: the ellipse |L d|^2 <= reach meets the rectangle of the pixel centers of block i, made wider by a margin. The
+// least |L d|^2 in a rectangle is on one of its sides that face the mean, or it is 0.
 template <class T>
 inline BlockMask reached_blocks(const Splat<T>& s, const TilePixels<T>& pixels) {
-  constexpr T side = BLOCK - 1;
   const T reach = s.log2_opacity - s.least_exponent, ratio = s.half_x > 0 ? s.half_y / s.half_x : T(0);
   const T tilt_x = -s.l21 / s.l11, tilt_y = tilt_x * ratio * ratio;  // of the lines of least |L d|^2 in x and in y
   const T margin_x = T(BOX_MARGIN) + T(1e-5) * s.half_x, margin_y = T(BOX_MARGIN) + T(1e-5) * s.half_y;
   BlockMask mask = 0;
   for (int i = 0; i < BLOCKS; i += LANES<T>) {
-    const Lanes<T> left = load(pixels.left + i) - (s.x + margin_x), right = left + (side + 2 * margin_x);
-    const Lanes<T> top = load(pixels.top + i) - (s.y + margin_y), bottom = top + (side + 2 * margin_y);
+    const Lanes<T> left = load(pixels.left + i) - (s.x + margin_x), right = left + (BLOCK_WIDTH - 1 + 2 * margin_x);
+    const Lanes<T> top = load(pixels.top + i) - (s.y + margin_y), bottom = top + (BLOCK_HEIGHT - 1 + 2 * margin_y);
     const Lanes<T> dx = larger(left, smaller(right, Lanes<T>{})), dy = larger(top, smaller(bottom, Lanes<T>{}));
     const Lanes<T> x = larger(left, smaller(right, tilt_x * dy)), y = larger(top, smaller(bottom, tilt_y * dx));
     const Lanes<T> a = s.l11 * dx + s.l21 * y, b = s.l22 * y, c = s.l11 * x + s.l21 * dy, d = s.l22 * dy;

@@ -36,7 +36,7 @@ void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t
   const TilePixels<T> pixels(x0, y0);
   TileCounters<T> c;
   sort_tile(ws, tile);
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
+  open_tile(c.transmittance, view, pixels), open_tile(c.product, view, pixels);
   for (int i = 0; i < PIXELS; ++i) c.best[i] = 0, c.best_pair[i] = -1;
   OpenBlocks<T> blocks{EXCLUSIVE ? c.product : c.transmittance, cuts.transmittance_min};
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {

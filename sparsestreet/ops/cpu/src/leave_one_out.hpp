@@ -12,19 +12,17 @@ struct TileBehind {
 };
 
 template <class T>
-inline void behind_everything(const TileColors<T>& total, const View& view, const Backdrop& sky_image,
-                              const TilePixels<T>& pixels, TileBehind<T>& behind) {
+inline void behind_everything(const TileColors<T>& total, const View& view, const Backdrop& sky_image, int64_t x0,
+                              int64_t y0, TileBehind<T>& behind) {
   const T* blended[3] = {total.red, total.green, total.blue};
   const T *background = static_cast<const T*>(sky_image.rgb), *weights = static_cast<const T*>(sky_image.pixel_weights);
-  for (int i = 0; i < PIXELS; ++i) {
-    const int64_t x = int64_t(pixels.x[i]), y = int64_t(pixels.y[i]), pixel = y * view.width + x;
-    const bool inside = x < view.width && y < view.height;
-    behind.pixel_weight[i] = weights && inside ? weights[pixel] : T(1);
+  for_each_pixel(view, x0, y0, [&](int at, int64_t pixel) {
+    behind.pixel_weight[at] = weights ? weights[pixel] : T(1);
     for (int channel = 0; channel < 3; ++channel) {
-      const T back = background && inside ? background[3 * pixel + channel] : T(0);
-      behind.color[channel][i] = blended[channel][i] + total.transmittance[i] * back;
+      const T back = background ? background[3 * pixel + channel] : T(0);
+      behind.color[channel][at] = blended[channel][at] + total.transmittance[at] * back;
     }
-  }
+  });
 }
 
 template <class T, bool EXCLUSIVE>
@@ -50,14 +48,14 @@ void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
   const TilePixels<T> pixels(x0, y0);
   TileColors<T> c;
-  TileBehind<T> behind;
+  TileBehind<T> behind{};
   std::memset(static_cast<void*>(&c), 0, sizeof(c));
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
+  open_tile(c.transmittance, view, pixels), open_tile(c.product, view, pixels);
   int64_t samples = 0;
   sort_tile(ws, tile);
   const int64_t end = blend_tile<T, EXCLUSIVE, false>(ws, cuts, tile, pixels, c, samples);
-  behind_everything(c, view, sky_image, pixels, behind);
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
+  behind_everything(c, view, sky_image, x0, y0, behind);
+  open_tile(c.transmittance, view, pixels), open_tile(c.product, view, pixels);
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     Lanes<T> largest{}, squared{};

@@ -49,9 +49,9 @@ inline Lanes<T> still_open(const Lanes<T>& alpha, const Cuts<T>& cuts, const Lan
 
 // 1 inside the image, 0 outside: pixels outside are finished from the start.
 template <class T>
-inline void open_tile(T* state, const View& view, int64_t x0, int64_t y0) {
-  for (int y = 0; y < TILE; ++y)
-    for (int x = 0; x < TILE; ++x) state[place(x, y)] = T(x0 + x < view.width && y0 + y < view.height);
+inline void open_tile(T* state, const View& view, const TilePixels<T>& pixels) {
+  const T width = T(view.width), height = T(view.height);
+  for (int at = 0; at < PIXELS; ++at) state[at] = T(pixels.x[at] < width && pixels.y[at] < height);
 }
 
 }  // namespace SPLAT_VARIANT

@@ -16,11 +16,14 @@ struct Range {
 };
 
 constexpr int PIXELS = TILE * TILE;
-constexpr int BLOCK = 4, BLOCK_PIXELS = BLOCK * BLOCK;  // at 4, the floats of a block are one AVX-512 register
-constexpr int BLOCKS_ACROSS = TILE / BLOCK, BLOCKS = BLOCKS_ACROSS * BLOCKS_ACROSS;
-using BlockMask = std::conditional_t<BLOCKS <= 16, uint16_t, uint64_t>;  // bit i: block i of a tile
+// The floats of a block are one register of AVX-512 (4x4 pixels) or of AVX2 (4x2), two of SSE (4x2). The most blocks
+// that a mask can hold are 64.
+constexpr int BLOCK_WIDTH = 4, BLOCK_HEIGHT = LANES<float> == 16 || TILE > 16 ? 4 : 2;
+constexpr int BLOCK_PIXELS = BLOCK_WIDTH * BLOCK_HEIGHT;
+constexpr int BLOCKS_ACROSS = TILE / BLOCK_WIDTH, BLOCKS = PIXELS / BLOCK_PIXELS;
+// Bit i: block i of a tile.
+using BlockMask = std::conditional_t<BLOCKS <= 16, uint16_t, std::conditional_t<BLOCKS <= 32, uint32_t, uint64_t>>;
 constexpr BlockMask ALL_BLOCKS = BlockMask(~uint64_t(0) >> (64 - BLOCKS));
-constexpr int BLOCK_LANES = BLOCKS < 16 ? 16 : BLOCKS;  // whole registers
 
 constexpr double BOX_MARGIN = 0.01;  // pixels; rounding must never cull a touched pixel
 
