@@ -35,20 +35,15 @@ inline void blend_register(const Splat<T>& s, const TilePixels<T>& pixels, const
 template <class T, bool EXCLUSIVE, bool GATED>
 int64_t blend_tile(Workspace<T>& ws, const Cuts<T> cuts, int64_t tile, const TilePixels<T>& pixels, TileColors<T>& c,
                    int64_t& samples) {
-  const int64_t begin = ws.tile_begin[tile], end = ws.tile_begin[tile + 1];
-  OpenBlocks<T> blocks{EXCLUSIVE ? c.product : c.transmittance, cuts.transmittance_min};
-  for (int64_t k = begin; k < end; ++k) {
-    if (k + PREFETCH < end) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
-    const Splat<T> s = ws.splats[ws.pairs[k].row];  // a copy: no store to the tile can change it
-    const BlockMask mask = blocks.of(ws, s, pixels, k - begin);
-    if (blocks.open == 0) return k;
-    ws.masks[k] = mask;
-    samples += __builtin_popcountll(mask) * BLOCK_PIXELS;
-    for_each_register<T>(mask, [&](int at) {
-      blend_register<T, EXCLUSIVE, GATED>(s, pixels, cuts, c, at, T(k - begin));
+  const T* state = EXCLUSIVE ? c.product : c.transmittance;
+  const auto visit = [&](int64_t k, const Splat<T>& given) {
+    const Splat<T> s = given;  // a copy: no store to the tile can change it
+    samples += __builtin_popcountll(ws.masks[k]) * BLOCK_PIXELS;
+    for_each_register<T>(ws.masks[k], [&](int at) {
+      blend_register<T, EXCLUSIVE, GATED>(s, pixels, cuts, c, at, T(k - ws.tile_begin[tile]));
     });
-  }
-  return end;
+  };
+  return for_each_pair(ws, tile, pixels, state, cuts.transmittance_min, visit);
 }
 
 template <class T>

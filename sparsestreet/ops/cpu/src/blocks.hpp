@@ -61,29 +61,41 @@ inline void for_each_register(BlockMask mask, Visit visit) {
   }
 }
 
-// Pairs between two looks at which blocks are finished.
-constexpr int64_t LOOK = 16;
-
-// The blocks that a splat is blended in: those that it reaches and that have a pixel whose `state` is above `least`.
+// The blocks that have a pixel whose state is above `least`.
 template <class T>
-struct OpenBlocks {
-  const T* state;
-  T least;
-  BlockMask open = ALL_BLOCKS;
+inline BlockMask open_blocks(const T* state, T least) {
+  BlockMask open = 0;
+  for (int block = 0; block < BLOCKS; ++block) {
+    Integers<T> some{};
+    for (int i = 0; i < BLOCK_PIXELS; i += LANES<T>) some |= load(state + block * BLOCK_PIXELS + i) > least;
+    open |= BlockMask(bits<T>(some) != 0) << block;
+  }
+  return open;
+}
 
-  // Of the pair that is the k-th of its tile; called for one after the other.
-  BlockMask of(const Workspace<T>& ws, const Splat<T>& s, const TilePixels<T>& pixels, int64_t k) {
-    if (k % LOOK == 0) look();
-    return ws.bounded ? reached_blocks(s, pixels) & open : open;
-  }
-  void look() {
-    open = 0;
-    for (int block = 0; block < BLOCKS; ++block) {
-      Integers<T> some{};
-      for (int i = 0; i < BLOCK_PIXELS; i += LANES<T>) some |= load(state + block * BLOCK_PIXELS + i) > least;
-      open |= BlockMask(bits<T>(some) != 0) << block;
+// Pairs between two looks at which blocks are finished; their masks are made together, since a loop over the bits of a
+// mask that is not known yet stalls.
+constexpr int64_t LOOK = 16;
+// Splats ahead whose record is fetched.
+constexpr int64_t PREFETCH = 8;
+
+// Calls visit(k, splat) for each pair of a tile, nearest first, until all pixels are finished, and answers the index after
+// the last one. ws.masks[k]: the blocks that the splat reaches and that are not finished, their `state` above `least`.
+template <class T, class Visit>
+inline int64_t for_each_pair(Workspace<T>& ws, int64_t tile, const TilePixels<T>& pixels, const T* state, T least,
+                             Visit visit) {
+  const int64_t begin = ws.tile_begin[tile], end = ws.tile_begin[tile + 1];
+  for (int64_t first = begin; first < end; first += LOOK) {
+    const int64_t last = first + LOOK < end ? first + LOOK : end;
+    const BlockMask open = open_blocks(state, least);
+    if (open == 0) return first;
+    for (int64_t k = first; k < last; ++k) {
+      if (k + PREFETCH < end) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
+      ws.masks[k] = ws.bounded ? reached_blocks(ws.splats[ws.pairs[k].row], pixels) & open : open;
     }
+    for (int64_t k = first; k < last; ++k) visit(k, ws.splats[ws.pairs[k].row]);
   }
-};
+  return end;
+}
 
 }  // namespace SPLAT_VARIANT

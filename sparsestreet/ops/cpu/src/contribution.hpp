@@ -38,15 +38,16 @@ void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t
   sort_tile(ws, tile);
   open_tile(c.transmittance, view, pixels), open_tile(c.product, view, pixels);
   for (int i = 0; i < PIXELS; ++i) c.best[i] = 0, c.best_pair[i] = -1;
-  OpenBlocks<T> blocks{EXCLUSIVE ? c.product : c.transmittance, cuts.transmittance_min};
-  for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
-    const Splat<T>& s = ws.splats[ws.pairs[k].row];
+  const T* state = EXCLUSIVE ? c.product : c.transmittance;
+  const auto visit = [&](int64_t k, const Splat<T>& s) {
     typename Workspace<T>::Count count{0, 0, 0};
-    for_each_register<T>(blocks.of(ws, s, pixels, k - ws.tile_begin[tile]), [&](int at) {
+    for_each_register<T>(ws.masks[k], [&](int at) {
       count_register<T, EXCLUSIVE>(s, pixels, cuts, c, at, k, count);
     });
     ws.count_slots[ws.pairs[k].slot] = count;
-  }
+  };
+  int64_t end = for_each_pair(ws, tile, pixels, state, cuts.transmittance_min, visit);
+  for (; end < ws.tile_begin[tile + 1]; ++end) ws.count_slots[ws.pairs[end].slot] = {0, 0, 0};
   for (int i = 0; i < PIXELS; ++i)
     if (c.best_pair[i] >= 0) ++ws.count_slots[ws.pairs[c.best_pair[i]].slot].dominant;
 }

@@ -14,9 +14,6 @@ struct Cuts {
         transmittance_min(std::fmax(T(v.transmittance_min), sizeof(T) == 4 ? T(1e-30) : T(1e-280))) {}
 };
 
-// Splats ahead whose record is fetched while one is blended.
-constexpr int64_t PREFETCH = 8;
-
 template <class T>
 struct Sample {
   Lanes<T> dx, dy, a, b;  // d and L d
