@@ -36,8 +36,8 @@ def rasterize(
     """Project, sort by tile and blend; float32 or float64. Bitwise the same for any number of threads.
 
     ``variant`` picks an instruction set: 0 baseline, 1 x86-64-v3, 2 x86-64-v4, -1 the fastest that runs here.
-    ``every_tile`` lists each splat in every tile and visits all pixels of the tile, as a check of lists and masks. It is
-    slow, and gives the same layers and infinite radii.
+    ``every_tile`` lists each splat in every tile and visits all pixels of the tile, as a check of lists and masks. It
+    is slow, and gives the same layers and infinite radii.
     """
     check_dtype(gaussians, "backend 'cpu'")
     g = gaussians

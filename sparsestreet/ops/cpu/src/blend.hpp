@@ -15,8 +15,8 @@ struct TileColors {
 
 // GATED: the row's gate multiplies its alpha. Backward reaches what a gate of 0 hides, up to where the pixel ends.
 template <class T, bool EXCLUSIVE, bool GATED>
-inline void blend_register(const Splat<T>& s, const TilePixels<T>& pixels, const Cuts<T>& cuts, TileColors<T>& c, int at,
-                           T pair) {
+inline void blend_register(const Splat<T>& s, const TilePixels<T>& pixels, const Cuts<T>& cuts, TileColors<T>& c,
+                           int at, T pair) {
   const Lanes<T> transmittance = load(c.transmittance + at);
   const Lanes<T> drawn = sample(s, pixels, at, cuts).alpha;
   const Lanes<T> alpha = still_open<T, EXCLUSIVE>(GATED ? drawn * s.gate : drawn, cuts, transmittance, c.product + at);

@@ -1,5 +1,5 @@
-// A tile's pixels in blocks, and which blocks a splat reaches. While a tile is worked on, its pixels lie block by block,
-// so that a register holds pixels that are near each other: in a line of 16, three of four would be outside the splat.
+// A tile's pixels in blocks, and which blocks a splat reaches. While a tile is worked on, its pixels lie block by
+// block, so that a register holds pixels near each other: in a line of 16, three of four would be outside the splat.
 #pragma once
 #include "workspace.hpp"
 
@@ -7,7 +7,9 @@ namespace SPLAT_VARIANT {
 
 // Column and line, in the tile, of the pixel that lies at a place of the tile's arrays.
 inline int column_of(int at) { return at / BLOCK_PIXELS % BLOCKS_ACROSS * BLOCK_WIDTH + at % BLOCK_WIDTH; }
-inline int line_of(int at) { return at / BLOCK_PIXELS / BLOCKS_ACROSS * BLOCK_HEIGHT + at % BLOCK_PIXELS / BLOCK_WIDTH; }
+inline int line_of(int at) {
+  return at / BLOCK_PIXELS / BLOCKS_ACROSS * BLOCK_HEIGHT + at % BLOCK_PIXELS / BLOCK_WIDTH;
+}
 
 // Calls visit(at, pixel) for each pixel of a tile that is in the image; pixel: its index there.
 template <class Visit>
@@ -79,8 +81,8 @@ constexpr int64_t LOOK = 16;
 // Splats ahead whose record is fetched.
 constexpr int64_t PREFETCH = 8;
 
-// Calls visit(k, splat) for each pair of a tile, nearest first, until all pixels are finished, and answers the index after
-// the last one. ws.masks[k]: the blocks that the splat reaches and that are not finished, their `state` above `least`.
+// Calls visit(k, splat) for each pair of a tile, nearest first, until all pixels are finished, and answers the index
+// after the last one. ws.masks[k]: the blocks that the splat reaches and that have a pixel of `state` above `least`.
 template <class T, class Visit>
 inline int64_t for_each_pair(Workspace<T>& ws, int64_t tile, const TilePixels<T>& pixels, const T* state, T least,
                              Visit visit) {

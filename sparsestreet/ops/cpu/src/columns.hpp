@@ -33,7 +33,8 @@ inline void transpose(Lanes<T>* square) {
   if constexpr (half > 1) transpose<T, half / 2>(square);
 }
 
-// One step of the sums: lanes of the rows below go where the upper half of each 2 * half lanes was added to the lower.
+// One step of the sums: of each 2 * half lanes of a row, one half is added to the other; there the row `half` below
+// puts its own.
 template <class T, int half, int... i>
 inline void add_halves(Lanes<T>* square, std::integer_sequence<int, i...>) {
   for (int r = 0; r < half; ++r) {
