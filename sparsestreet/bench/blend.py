@@ -117,7 +117,7 @@ def block_weights(
     return alpha * before, (1 - alpha).prod(1)
 
 
-FORWARD_FLOPS, BACKWARD_FLOPS = 30, 57
+FORWARD_FLOPS, BACKWARD_FLOPS = 36, 65
 """Operations per (splat, pixel) sample of one color blend, and of its gradient."""
 SETTINGS = SplatSettings()
 MAIN = Size(640, 384, 100_000)

@@ -18,9 +18,9 @@ from sparsestreet.phases import phase
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 PAIR_LIMIT = 1 << 28
-"""Most (splat, tile) pairs of one rendering. A pair takes 24 bytes forward and 48 more backward in float32.
+"""Most (splat, tile) pairs of one rendering. A pair takes 26 to 28 bytes forward and 48 more backward in float32.
 
-In float64 it takes 32 and 96. Buffers that have just grown are a quarter larger: up to 24 GB in float32."""
+In float64 it takes 34 to 36 and 96. Buffers that have just grown are a quarter larger: up to 24 GB in float32."""
 
 
 def rasterize(
@@ -36,8 +36,8 @@ def rasterize(
     """Project, sort by tile and blend; float32 or float64. Bitwise the same for any number of threads.
 
     ``variant`` picks an instruction set: 0 baseline, 1 x86-64-v3, 2 x86-64-v4, -1 the fastest that runs here.
-    ``every_tile`` lists each splat in every tile and visits all lines of the tile, as a check of the lists. It is slow,
-    and gives the same layers and infinite radii.
+    ``every_tile`` lists each splat in every tile and visits all pixels of the tile, as a check of lists and masks. It
+    is slow, and gives the same layers and infinite radii.
     """
     check_dtype(gaussians, "backend 'cpu'")
     g = gaussians

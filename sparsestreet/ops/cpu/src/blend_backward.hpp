@@ -7,6 +7,7 @@
 #pragma once
 #include <omp.h>
 
+#include "columns.hpp"
 #include "pixel.hpp"
 
 namespace SPLAT_VARIANT {
@@ -18,17 +19,10 @@ struct TileCotangents {
       depth[PIXELS];
 };
 
-// Sums over the rows of a tile, per column, of some neighboring columns.
-template <class T>
-struct Columns {
-  Lanes<T> s{}, sa{}, sb{}, sa_dy{}, sb_dy{}, abs_x{}, abs_y{}, red{}, green{}, blue{}, depth{}, gate{};
-};
-
 template <class T, bool GATED>
-inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
-                           int at, T pair, Columns<T>& sums) {
-  const T along = p.l21 * dy, b = p.l22 * dy, base = p.log2_opacity - b * b;
-  const Sample<T> q = sample(p, dx, along, base, cuts);
+inline void accumulate_register(const Splat<T>& p, const TilePixels<T>& pixels, const Cuts<T>& cuts,
+                                TileCotangents<T>& t, int at, T pair, Slot<Lanes<T>>& sums, Lanes<T>& gate) {
+  const Sample<T> q = sample(p, pixels, at, cuts);
   const Lanes<T> drawn = load(t.last + at) >= pair ? q.alpha : Lanes<T>{};
   const Lanes<T> alpha = GATED ? drawn * p.gate : drawn;
   const Lanes<T> inverse = T(1) / (T(1) - alpha), transmittance = load(t.transmittance + at) * inverse;
@@ -40,37 +34,40 @@ inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cu
   store(t.behind + at, behind + blended);
   Lanes<T> s = blended - alpha * inverse * behind;
   s = q.raw <= cuts.alpha_max ? s : Lanes<T>{};  // a clamped alpha has no derivative
-  if (GATED) sums.gate += drawn * (transmittance * light - inverse * behind);
-  const Lanes<T> sa = s * q.a, sb = s * b;
+  if (GATED) gate += drawn * (transmittance * light - inverse * behind);
+  const Lanes<T> sa = s * q.a, sb = s * q.b;
   sums.s += s;
   sums.sa += sa;
   sums.sb += sb;
-  sums.sa_dy += sa * dy;
-  sums.sb_dy += sb * dy;
+  sums.sa_dx += sa * q.dx;
+  sums.sa_dy += sa * q.dy;
+  sums.sb_dy += sb * q.dy;
   sums.abs_x += magnitude(sa);
   sums.abs_y += magnitude(p.l21 * sa + p.l22 * sb);
-  sums.red += weight * red;
-  sums.green += weight * green;
-  sums.blue += weight * blue;
+  sums.color[0] += weight * red;
+  sums.color[1] += weight * green;
+  sums.color[2] += weight * blue;
   sums.depth += weight * depth;
 }
 
 template <class T>
 inline T total(const Lanes<T>& values) {
-  T each[LANES<T>], sum = 0;
-  store(each, values);
-  for (int i = 0; i < LANES<T>; ++i) sum += each[i];
+  T sum = 0;
+  for (int i = 0; i < LANES<T>; ++i) sum += values[i];
   return sum;
 }
 
+// Sums over the lanes.
 template <class T>
-inline void add_columns(const Columns<T>& c, const Lanes<T>& dx, Slot<T>& slot) {
-  slot.s += total<T>(c.s), slot.sa += total<T>(c.sa), slot.sb += total<T>(c.sb);
-  slot.sa_dx += total<T>(c.sa * dx);  // dx is the same in every row of a column
-  slot.sa_dy += total<T>(c.sa_dy), slot.sb_dy += total<T>(c.sb_dy);
-  slot.abs_x += total<T>(c.abs_x), slot.abs_y += total<T>(c.abs_y);
-  slot.color[0] += total<T>(c.red), slot.color[1] += total<T>(c.green), slot.color[2] += total<T>(c.blue);
-  slot.depth += total<T>(c.depth);
+inline void store_totals(const Slot<Lanes<T>>& sums, Slot<T>& slot) {
+  const Lanes<T>* columns = &sums.s;
+  for (int c = 0; c < SLOT_COLUMNS<T>; c += LANES<T>) {
+    const int count = SLOT_COLUMNS<T> - c < LANES<T> ? SLOT_COLUMNS<T> - c : LANES<T>;
+    Lanes<T> square[LANES<T>] = {};
+    for (int i = 0; i < count; ++i) square[i] = columns[c + i];
+    const Lanes<T> totals = row_sums<T>(square);
+    __builtin_memcpy(&slot.s + c, &totals, count * sizeof(T));
+  }
 }
 
 // Loads the cotangents, and the light that got past everything.
@@ -80,19 +77,16 @@ void load_tile(TileCotangents<T>& t, const View& view, int64_t x0, int64_t y0, c
   std::memset(static_cast<void*>(&t), 0, sizeof(t));
   const T *v_rgb = static_cast<const T*>(cotangents.rgb), *v_depth = static_cast<const T*>(cotangents.depth_sum);
   const T* v_passed = static_cast<const T*>(cotangents.transmittance);
-  for (int64_t y = y0; y < y0 + TILE && y < view.height; ++y) {
-    for (int64_t x = x0; x < x0 + TILE && x < view.width; ++x) {
-      const int64_t to = (y - y0) * TILE + x - x0, from = y * view.width + x;
-      t.transmittance[to] = passed[from];
-      if (v_passed) t.behind[to] = passed[from] * v_passed[from];
-      if (v_depth) t.depth[to] = v_depth[from];
-      if (v_rgb) t.red[to] = v_rgb[3 * from], t.green[to] = v_rgb[3 * from + 1], t.blue[to] = v_rgb[3 * from + 2];
-    }
-  }
+  for_each_pixel(view, x0, y0, [&](int to, int64_t from) {
+    t.transmittance[to] = passed[from];
+    if (v_passed) t.behind[to] = passed[from] * v_passed[from];
+    if (v_depth) t.depth[to] = v_depth[from];
+    if (v_rgb) t.red[to] = v_rgb[3 * from], t.green[to] = v_rgb[3 * from + 1], t.blue[to] = v_rgb[3 * from + 2];
+  });
 }
 
 template <class T, bool GATED>
-void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
+void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, const TilePixels<T>& pixels,
                          TileCotangents<T>& t) {
   const int64_t begin = ws.tile_begin[tile], end = ws.tile_end[tile];
   for (int64_t k = ws.tile_begin[tile + 1] - 1; k >= end; --k) {
@@ -105,19 +99,13 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
       __builtin_prefetch(&ws.slots[ws.pairs[k - PREFETCH].slot], 1);
     }
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
-    const TileSplat<T> here(s, x0, y0);
-    Slot<T> slot{};
-    T gate = 0;
-    for (int x = 0; x < TILE; x += LANES<T>) {
-      const Lanes<T> dx = load(here.dx + x);
-      Columns<T> sums;
-      for (int y = here.first; y <= here.last; ++y)
-        accumulate_row<T, GATED>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums);
-      add_columns(sums, dx, slot);
-      if (GATED) gate += total<T>(sums.gate);
-    }
-    ws.slots[ws.pairs[k].slot] = slot;
-    if (GATED) ws.gate_slots[ws.pairs[k].slot] = gate;
+    Slot<Lanes<T>> sums{};
+    Lanes<T> gate{};
+    for_each_register<T>(ws.masks[k], [&](int at) {
+      accumulate_register<T, GATED>(s, pixels, cuts, t, at, T(k - begin), sums, gate);
+    });
+    store_totals(sums, ws.slots[ws.pairs[k].slot]);
+    if (GATED) ws.gate_slots[ws.pairs[k].slot] = total<T>(gate);
   }
 }
 
@@ -127,10 +115,11 @@ void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmitt
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
     const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
+    const TilePixels<T> pixels(x0, y0);
     TileCotangents<T> t;
     load_tile(t, view, x0, y0, transmittance, cotangents);
     std::memcpy(t.last, &ws.last_pairs[tile * PIXELS], sizeof(t.last));
-    blend_tile_backward<T, GATED>(ws, cuts, tile, x0, y0, t);
+    blend_tile_backward<T, GATED>(ws, cuts, tile, pixels, t);
   }
 }
 

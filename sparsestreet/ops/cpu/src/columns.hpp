@@ -33,6 +33,25 @@ inline void transpose(Lanes<T>* square) {
   if constexpr (half > 1) transpose<T, half / 2>(square);
 }
 
+// One step of the sums: of each 2 * half lanes of a row, one half is added to the other; there the row `half` below
+// puts its own.
+template <class T, int half, int... i>
+inline void add_halves(Lanes<T>* square, std::integer_sequence<int, i...>) {
+  for (int r = 0; r < half; ++r) {
+    const Lanes<T> a = square[r], b = square[r + half];
+    square[r] = picked<T, (i & half ? LANES<T> + i : i)...>(a, b) +
+                picked<T, (i & half ? LANES<T> + i - half : i + half)...>(a, b);
+  }
+}
+
+// Lane i: the sum of the lanes of square[i]. Spoils the square.
+template <class T, int half = LANES<T> / 2>
+inline Lanes<T> row_sums(Lanes<T>* square) {
+  add_halves<T, half>(square, std::make_integer_sequence<int, LANES<T>>{});
+  if constexpr (half > 1) return row_sums<T, half / 2>(square);
+  return square[0];
+}
+
 // out[c] lane r = row(r)[c]; row(r) must be readable for every lane.
 template <class T, class RowAt>
 inline void load_columns(RowAt row, int columns, Lanes<T>* out) {

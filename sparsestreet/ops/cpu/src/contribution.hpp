@@ -14,40 +14,40 @@ struct TileCounters {
   int64_t best_pair[PIXELS];
 };
 
-// Blends one row of a tile and keeps, per pixel, the pair that weighed most so far.
+// Blends a register of pixels and keeps, per pixel, the pair that weighed most so far.
 template <class T, bool EXCLUSIVE>
-inline void count_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileCounters<T>& c, int row,
-                      int64_t pair, typename Workspace<T>::Count& count) {
-  const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
-  for (int x = 0; x < TILE; x += LANES<T>) {
-    const int at = row * TILE + x;
-    const Lanes<T> transmittance = load(c.transmittance + at);
-    const Lanes<T> weight = transmittance * still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha,
-                                                                     cuts, transmittance, c.product + at);
-    store(c.transmittance + at, transmittance - weight);
-    for (int i = 0; i < LANES<T>; ++i) {
-      count.weight += double(weight[i]), count.pixels += weight[i] > 0;
-      // Strictly more: of equal weights the nearer splat keeps the pixel.
-      if (weight[i] > c.best[at + i]) c.best[at + i] = weight[i], c.best_pair[at + i] = pair;
-    }
+inline void count_register(const Splat<T>& s, const TilePixels<T>& pixels, const Cuts<T>& cuts, TileCounters<T>& c,
+                           int at, int64_t pair, typename Workspace<T>::Count& count) {
+  const Lanes<T> transmittance = load(c.transmittance + at);
+  const Lanes<T> alpha = sample(s, pixels, at, cuts).alpha;
+  const Lanes<T> weight =
+      transmittance * still_open<T, EXCLUSIVE>(alpha, cuts, transmittance, c.product + at);
+  store(c.transmittance + at, transmittance - weight);
+  for (int i = 0; i < LANES<T>; ++i) {
+    count.weight += double(weight[i]), count.pixels += weight[i] > 0;
+    // Strictly more: of equal weights the nearer splat keeps the pixel.
+    if (weight[i] > c.best[at + i]) c.best[at + i] = weight[i], c.best_pair[at + i] = pair;
   }
 }
 
 template <class T, bool EXCLUSIVE>
 void count_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile) {
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
+  const TilePixels<T> pixels(x0, y0);
   TileCounters<T> c;
   sort_tile(ws, tile);
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
+  open_tile(c.transmittance, view, pixels), open_tile(c.product, view, pixels);
   for (int i = 0; i < PIXELS; ++i) c.best[i] = 0, c.best_pair[i] = -1;
-  for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
-    const Splat<T>& s = ws.splats[ws.pairs[k].row];
-    const TileSplat<T> here(s, x0, y0);
+  const T* state = EXCLUSIVE ? c.product : c.transmittance;
+  const auto visit = [&](int64_t k, const Splat<T>& s) {
     typename Workspace<T>::Count count{0, 0, 0};
-    for (int y = here.first; y <= here.last; ++y)
-      count_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, y, k, count);
+    for_each_register<T>(ws.masks[k], [&](int at) {
+      count_register<T, EXCLUSIVE>(s, pixels, cuts, c, at, k, count);
+    });
     ws.count_slots[ws.pairs[k].slot] = count;
-  }
+  };
+  int64_t end = for_each_pair(ws, tile, pixels, state, cuts.transmittance_min, visit);
+  for (; end < ws.tile_begin[tile + 1]; ++end) ws.count_slots[ws.pairs[end].slot] = {0, 0, 0};
   for (int i = 0; i < PIXELS; ++i)
     if (c.best_pair[i] >= 0) ++ws.count_slots[ws.pairs[c.best_pair[i]].slot].dominant;
 }

@@ -26,7 +26,7 @@ struct View {
   int64_t has_lens, has_shutter;
   int64_t shutter_columns;  // read one after the other, instead of rows
   int64_t shutter_sign;     // -1 if the readout runs towards smaller coordinates, else 1
-  int64_t every_tile;  // lists each splat in every tile and looks at all their rows: to check the lists against
+  int64_t every_tile;  // lists each splat in every tile and looks at all their pixels: to check lists and masks against
   int64_t pair_limit;  // (splat, tile) pairs that may be held
   int64_t threads;
 };

@@ -1,7 +1,10 @@
-// Registers of the instruction set at hand: pixels of a tile row, and rows of Gaussians, are worked on a register at a
-// time, so that the sums over a splat's rows stay in registers. (Left to the compiler alone they go to memory in every
-// row; vectors wider than a register are split badly.)
+// Registers of the instruction set at hand: pixels of a tile, and rows of Gaussians, are worked on a register at a
+// time, so that the sums over a splat's pixels stay in registers. (Left to the compiler alone they go to memory every
+// time; vectors wider than a register are split badly.)
 #pragma once
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
 #include <cmath>
 #include <cstdint>
 
@@ -17,9 +20,8 @@ constexpr int REGISTER_BYTES = 32;
 constexpr int REGISTER_BYTES = 16;
 #endif
 
-// No more than the pixels of a tile row. (Projecting rows with whole registers all the same would gain it a tenth.)
 template <class T>
-constexpr int LANES = REGISTER_BYTES / int(sizeof(T)) < splat::TILE ? REGISTER_BYTES / int(sizeof(T)) : splat::TILE;
+constexpr int LANES = REGISTER_BYTES / int(sizeof(T));
 
 template <class T>
 struct LanesOf;
@@ -68,6 +70,22 @@ inline Integers<T> as_integers(const Lanes<T>& v) {
   Integers<T> bits;
   __builtin_memcpy(&bits, &v, sizeof(v));
   return bits;
+}
+
+// Bit i: lane i of a comparison.
+template <class T>
+inline uint32_t bits(const Integers<T>& comparison) {
+#if defined(__AVX512DQ__)
+  if constexpr (sizeof(T) == 4) return _mm512_movepi32_mask(reinterpret_cast<const __m512i&>(comparison));
+  else return _mm512_movepi64_mask(reinterpret_cast<const __m512i&>(comparison));
+#elif defined(__AVX2__)
+  if constexpr (sizeof(T) == 4) return _mm256_movemask_ps(reinterpret_cast<const __m256&>(comparison));
+  else return _mm256_movemask_pd(reinterpret_cast<const __m256d&>(comparison));
+#else
+  uint32_t all = 0;
+  for (int i = 0; i < LANES<T>; ++i) all |= uint32_t(comparison[i] != 0) << i;
+  return all;
+#endif
 }
 
 // 2^x for x in [-126, 0]: rounding and a minimax polynomial of degree 5 on [-1/2, 1/2] (relative error 1.2e-7).

@@ -16,58 +16,52 @@ inline void behind_everything(const TileColors<T>& total, const View& view, cons
                               int64_t y0, TileBehind<T>& behind) {
   const T* blended[3] = {total.red, total.green, total.blue};
   const T *background = static_cast<const T*>(sky_image.rgb), *weights = static_cast<const T*>(sky_image.pixel_weights);
-  for (int i = 0; i < PIXELS; ++i) {
-    const int64_t x = x0 + i % TILE, y = y0 + i / TILE, pixel = y * view.width + x;
-    const bool inside = x < view.width && y < view.height;
-    behind.pixel_weight[i] = weights && inside ? weights[pixel] : T(1);
+  for_each_pixel(view, x0, y0, [&](int at, int64_t pixel) {
+    behind.pixel_weight[at] = weights ? weights[pixel] : T(1);
     for (int channel = 0; channel < 3; ++channel) {
-      const T back = background && inside ? background[3 * pixel + channel] : T(0);
-      behind.color[channel][i] = blended[channel][i] + total.transmittance[i] * back;
+      const T back = background ? background[3 * pixel + channel] : T(0);
+      behind.color[channel][at] = blended[channel][at] + total.transmittance[at] * back;
     }
-  }
+  });
 }
 
 template <class T, bool EXCLUSIVE>
-inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileColors<T>& c,
-                       TileBehind<T>& behind, int row, Lanes<T>& largest, Lanes<T>& squared) {
-  const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
-  for (int x = 0; x < TILE; x += LANES<T>) {
-    const int at = row * TILE + x;
-    const Lanes<T> transmittance = load(c.transmittance + at);
-    const Lanes<T> alpha = still_open<T, EXCLUSIVE>(sample(s, load(dx + x), along, base, cuts).alpha, cuts,
-                                                    transmittance, c.product + at);
-    const Lanes<T> weight = alpha * transmittance, through = alpha / (T(1) - alpha);
-    store(c.transmittance + at, transmittance - weight);
-    Lanes<T> sum{};
-    for (int channel = 0; channel < 3; ++channel) {
-      const Lanes<T> own = weight * s.color[channel], rest = load(behind.color[channel] + at) - own;
-      store(behind.color[channel] + at, rest);
-      const Lanes<T> change = rest * through - own;
-      largest = larger(largest, magnitude(change));
-      sum += change * change;
-    }
-    squared += load(behind.pixel_weight + at) * sum;
+inline void remove_register(const Splat<T>& s, const TilePixels<T>& pixels, const Cuts<T>& cuts, TileColors<T>& c,
+                            TileBehind<T>& behind, int at, Lanes<T>& largest, Lanes<T>& squared) {
+  const Lanes<T> transmittance = load(c.transmittance + at), drawn = sample(s, pixels, at, cuts).alpha;
+  const Lanes<T> alpha = still_open<T, EXCLUSIVE>(drawn, cuts, transmittance, c.product + at);
+  const Lanes<T> weight = alpha * transmittance, through = alpha / (T(1) - alpha);
+  store(c.transmittance + at, transmittance - weight);
+  Lanes<T> sum{};
+  for (int channel = 0; channel < 3; ++channel) {
+    const Lanes<T> own = weight * s.color[channel], rest = load(behind.color[channel] + at) - own;
+    store(behind.color[channel] + at, rest);
+    const Lanes<T> change = rest * through - own;
+    largest = larger(largest, magnitude(change));
+    sum += change * change;
   }
+  squared += load(behind.pixel_weight + at) * sum;
 }
 
 template <class T, bool EXCLUSIVE>
 void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const Backdrop& sky_image) {
   const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
+  const TilePixels<T> pixels(x0, y0);
   TileColors<T> c;
-  TileBehind<T> behind;
+  TileBehind<T> behind{};
   std::memset(static_cast<void*>(&c), 0, sizeof(c));
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
+  open_tile(c.transmittance, view, pixels), open_tile(c.product, view, pixels);
   int64_t samples = 0;
   sort_tile(ws, tile);
-  blend_tile<T, EXCLUSIVE, false>(ws, cuts, tile, x0, y0, c, samples);
+  const int64_t end = blend_tile<T, EXCLUSIVE, false>(ws, cuts, tile, pixels, c, samples);
   behind_everything(c, view, sky_image, x0, y0, behind);
-  open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
+  open_tile(c.transmittance, view, pixels), open_tile(c.product, view, pixels);
   for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
-    const TileSplat<T> here(s, x0, y0);
     Lanes<T> largest{}, squared{};
-    for (int y = here.first; y <= here.last; ++y)
-      remove_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, behind, y, largest, squared);
+    for_each_register<T>(k < end ? ws.masks[k] : BlockMask(0), [&](int at) {
+      remove_register<T, EXCLUSIVE>(s, pixels, cuts, c, behind, at, largest, squared);
+    });
     typename Workspace<T>::Change change{0, 0};
     for (int i = 0; i < LANES<T>; ++i) {
       change.largest = largest[i] > change.largest ? double(largest[i]) : change.largest;

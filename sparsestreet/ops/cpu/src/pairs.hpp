@@ -43,7 +43,7 @@ void begin_tiles(Workspace<T>& ws, int64_t tiles, int64_t parts) {
 template <class T>
 void fill_tiles(Workspace<T>& ws, const Grid<T>& grid, int64_t rows, int64_t parts) {
   const int64_t tiles = grid.tiles_x * grid.tiles_y, threads = rows < ROWS_WORTH_THREADS ? 1 : parts;
-  ws.pairs.reserve(ws.pair_count), ws.other_pairs.reserve(ws.pair_count);
+  ws.pairs.reserve(ws.pair_count), ws.other_pairs.reserve(ws.pair_count), ws.masks.reserve(ws.pair_count);
 #pragma omp parallel for num_threads(threads) schedule(static)
   for (int64_t part = 0; part < parts; ++part) {
     int64_t *next = &ws.histogram[part * tiles], slot = ws.part_slots[part];

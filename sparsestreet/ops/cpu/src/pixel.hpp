@@ -1,6 +1,6 @@
-// What the pixel loops share: alpha, the stop rule, and where a splat meets a tile.
+// What the pixel loops share: alpha and the stop rule.
 #pragma once
-#include "workspace.hpp"
+#include "blocks.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -14,37 +14,20 @@ struct Cuts {
         transmittance_min(std::fmax(T(v.transmittance_min), sizeof(T) == 4 ? T(1e-30) : T(1e-280))) {}
 };
 
-// Splats ahead whose record is fetched while one is blended.
-constexpr int64_t PREFETCH = 8;
-// Pairs between two looks at whether the whole tile is finished.
-constexpr int64_t LOOK = 16;
-
-// The part of a splat in one tile: dx per column, and the rows of the tile it reaches.
-template <class T>
-struct TileSplat {
-  alignas(64) T dx[TILE];
-  int first, last;  // inclusive
-  TileSplat(const Splat<T>& s, int64_t x0, int64_t y0) {
-    const T offset = T(x0) + T(0.5) - s.x;
-    for (int i = 0; i < TILE; ++i) dx[i] = offset + T(i);
-    first = int(s.first_row > y0 ? s.first_row - y0 : 0);
-    last = int(s.last_row < y0 + TILE - 1 ? s.last_row - y0 : TILE - 1);
-  }
-};
-
 template <class T>
 struct Sample {
-  Lanes<T> a;      // first component of L d
-  Lanes<T> raw;    // alpha before the clamp
-  Lanes<T> alpha;  // 0 past the splat's end
+  Lanes<T> dx, dy, a, b;  // d and L d
+  Lanes<T> raw;           // alpha before the clamp
+  Lanes<T> alpha;         // 0 past the splat's end
 };
 
-// Evaluates a splat in neighboring pixels of one row.
+// Evaluates a splat in a register of pixels.
 template <class T>
-inline Sample<T> sample(const Splat<T>& s, const Lanes<T>& dx, T along, T base, const Cuts<T>& cuts) {
+inline Sample<T> sample(const Splat<T>& s, const TilePixels<T>& pixels, int at, const Cuts<T>& cuts) {
   Sample<T> p;
-  p.a = s.l11 * dx + along;
-  const Lanes<T> exponent = base - p.a * p.a;
+  p.dx = load(pixels.x + at) - s.x, p.dy = load(pixels.y + at) - s.y;
+  p.a = s.l11 * p.dx + s.l21 * p.dy, p.b = s.l22 * p.dy;
+  const Lanes<T> exponent = s.log2_opacity - p.b * p.b - p.a * p.a;
   p.raw = exp2_nonpositive(larger(exponent, same(T(-126))));
   p.alpha = exponent >= s.least_exponent ? smaller(p.raw, same(cuts.alpha_max)) : Lanes<T>{};
   return p;
@@ -61,18 +44,11 @@ inline Lanes<T> still_open(const Lanes<T>& alpha, const Cuts<T>& cuts, const Lan
   return passed > cuts.transmittance_min ? alpha : Lanes<T>{};
 }
 
-template <class T>
-inline bool tile_finished(const T* state, T least) {
-  T most = 0;
-  for (int i = 0; i < PIXELS; ++i) most = state[i] > most ? state[i] : most;
-  return most <= least;
-}
-
 // 1 inside the image, 0 outside: pixels outside are finished from the start.
 template <class T>
-inline void open_tile(T* state, const View& view, int64_t x0, int64_t y0) {
-  for (int y = 0; y < TILE; ++y)
-    for (int x = 0; x < TILE; ++x) state[y * TILE + x] = T(x0 + x < view.width && y0 + y < view.height);
+inline void open_tile(T* state, const View& view, const TilePixels<T>& pixels) {
+  const T width = T(view.width), height = T(view.height);
+  for (int at = 0; at < PIXELS; ++at) state[at] = T(pixels.x[at] < width && pixels.y[at] < height);
 }
 
 }  // namespace SPLAT_VARIANT

@@ -175,7 +175,7 @@ Status prepare(Workspace<T>& ws, const View& view, const Rows& rows, void* radii
   if (!valid) return BAD_VALUE;
   const double projected = omp_get_wtime();
   const Grid<T> grid{Camera<T>(view)};
-  ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y;
+  ws.tiles_x = grid.tiles_x, ws.tiles_y = grid.tiles_y, ws.bounded = grid.bounded;
   begin_tiles(ws, grid.tiles_x * grid.tiles_y, view.threads);
   report.pairs = ws.pair_count;
   if (ws.pair_count > view.pair_limit) {

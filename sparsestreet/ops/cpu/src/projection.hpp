@@ -7,7 +7,6 @@
 
 namespace SPLAT_VARIANT {
 
-constexpr double BOX_MARGIN = 0.01;               // pixels; rounding must never cull a touched pixel
 constexpr double COMPENSATION_FLOOR = 2.5e-5;     // least det / det_blurred of the antialias compensation
 constexpr double LEAST_OPACITY = 0x1p-126;        // below it log2 and its power of two are no inverses in float
 constexpr double DETERMINANT_MIN = 1e-12;         // px^4; only without eps2d: thinner splats touch no pixel center

@@ -15,8 +15,17 @@ struct Range {
   Range(int64_t count, int64_t part, int64_t parts) : begin(count * part / parts), end(count * (part + 1) / parts) {}
 };
 
-// At 16, a tile row of floats is one AVX-512 register, two AVX2 registers, four SSE registers.
 constexpr int PIXELS = TILE * TILE;
+// The floats of a block are one register of AVX-512 (4x4 pixels) or of AVX2 (4x2), two of SSE (4x2). The most blocks
+// that a mask can hold are 64.
+constexpr int BLOCK_WIDTH = 4, BLOCK_HEIGHT = LANES<float> == 16 || TILE > 16 ? 4 : 2;
+constexpr int BLOCK_PIXELS = BLOCK_WIDTH * BLOCK_HEIGHT;
+constexpr int BLOCKS_ACROSS = TILE / BLOCK_WIDTH, BLOCKS = PIXELS / BLOCK_PIXELS;
+// Bit i: block i of a tile.
+using BlockMask = std::conditional_t<BLOCKS <= 16, uint16_t, std::conditional_t<BLOCKS <= 32, uint32_t, uint64_t>>;
+constexpr BlockMask ALL_BLOCKS = BlockMask(~uint64_t(0) >> (64 - BLOCKS));
+
+constexpr double BOX_MARGIN = 0.01;  // pixels; rounding must never cull a touched pixel
 
 // One splat on the screen, 64 bytes as float, one cache line; or as many as a register has lanes.
 template <class V>
@@ -76,7 +85,8 @@ struct Workspace {
   Buffer<int64_t> part_slots;  // by part: its first slot
   Buffer<int64_t> tile_begin;  // tiles + 1
   Buffer<int64_t> tile_end;    // after the last pair that the forward loop looked at
-  Buffer<T> last_pairs;        // by tile and pixel: the last pair that was blended, counted from tile_begin; -1: none
+  Buffer<T> last_pairs;        // by tile and place: the last pair that was blended, counted from tile_begin; -1: none
+  Buffer<BlockMask> masks;     // by pair: the blocks in which the forward loop blended it
   Buffer<Pair<T>> pairs, other_pairs;  // by tile; other_pairs: room for sorting
   Buffer<Slot<T>> slots;
   Buffer<T> gate_slots;  // dLoss/d gate of each pair, of rows that have gates
@@ -90,12 +100,13 @@ struct Workspace {
   };
   Buffer<Change> change_slots;
   int64_t pair_count = 0, tiles_x = 0, tiles_y = 0;
+  bool bounded = false;  // lists of tiles and masks of blocks end where splats do
   int64_t samples = 0;  // (splat, pixel) pairs that the forward loops evaluated
   double seconds[STAGES] = {};
 
   void poison() {
     splats.poison(), tiles.poison(), histogram.poison(), part_slots.poison(), tile_begin.poison(), tile_end.poison();
-    pairs.poison(), other_pairs.poison(), last_pairs.poison(), slots.poison();
+    masks.poison(), pairs.poison(), other_pairs.poison(), last_pairs.poison(), slots.poison();
     gate_slots.poison(), count_slots.poison(), change_slots.poison();
   }
 };
