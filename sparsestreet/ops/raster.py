@@ -1,8 +1,8 @@
-"""What a backend returns to the op, before the background is added, or raises."""
+"""What a backend returns to the op, before the background is added, what it gathers beside gradients, or raises."""
 
 from dataclasses import dataclass
 
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from sparsestreet.demand import DemandError
@@ -41,3 +41,35 @@ class Raster:
     """Sum over splats of weight times depth, meters."""
     radii: Float[Tensor, " n"]
     """Half the longer side of the opacity-aware box, pixels; 0 for a culled row."""
+
+
+COUNTINGS = 3
+"""In how many ways squared changes are counted in one backward pass."""
+
+
+@dataclass(frozen=True)
+class RowChanges:
+    """How far one view changes without each row, and what the row adds to it."""
+
+    weight: Float64[Tensor, " n"]
+    """Sum of blend weights over the pixels, as ``Contribution`` has it."""
+    max_abs_change: Float64[Tensor, " n"]
+    """As ``LeaveOneOut`` has it."""
+    squared_change: Float64[Tensor, "n 3"]
+    """Sum over pixels and channels of the squared change times each of the pixel's three weights."""
+
+
+@dataclass
+class LeaveOneOutSums:
+    """What the backward pass of a view finds out beside its gradients: how far the view changes without each row.
+
+    It comes by -alpha dC/dalpha anyway, which ``leave_one_out`` computes in a pass of its own; both agree up to
+    rounding.
+    """
+
+    pixel_weights: Float[Tensor, "3 h w"]
+    """How much the squared change of each pixel counts, in three ways."""
+    background: Float[Tensor, "h w 3"] | None = None
+    """Light behind the splats; None: black."""
+    found: RowChanges | None = None
+    """None until the backward pass has run."""

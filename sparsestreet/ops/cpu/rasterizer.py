@@ -11,7 +11,7 @@ from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.lenses import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
-from sparsestreet.ops.raster import PairLimitError, Raster
+from sparsestreet.ops.raster import COUNTINGS, LeaveOneOutSums, PairLimitError, Raster, RowChanges
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype, check_values
 from sparsestreet.phases import phase
@@ -32,6 +32,7 @@ def rasterize(
     every_tile: bool = False,
     *,
     gates: Float[Tensor, " n"] | None = None,
+    changes: LeaveOneOutSums | None = None,
 ) -> Raster:
     """Project, sort by tile and blend; float32 or float64. Bitwise the same for any number of threads.
 
@@ -43,7 +44,7 @@ def rasterize(
     g = gaussians
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     view = _view(camera, settings, every_tile)
-    return Raster(*_Blend.apply(*fields, screen_offsets, gates, _moved(g), view, variant))
+    return Raster(*_Blend.apply(*fields, screen_offsets, gates, _moved(g), view, variant, changes))
 
 
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
@@ -92,7 +93,9 @@ class _Blend(torch.autograd.Function):
     """Maps five fields, the screen offsets and the gates to the layers of a Raster."""
 
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, displacements, view, variant):
+    def forward(
+        ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, displacements, view, variant, changes
+    ):  # fmt: skip
         ctx.set_materialize_grads(False)
         fields = tuple(field.contiguous() for field in (means, quaternions, scales, opacities, sh))
         gates = None if gates is None else gates.contiguous()
@@ -111,7 +114,7 @@ class _Blend(torch.autograd.Function):
         _raise_for(status, fields, displacements, report)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*fields, gates, displacements, transmittance)
-        ctx.view, ctx.lease = view, lease
+        ctx.view, ctx.lease, ctx.changes = view, lease, changes
         return rgb, transmittance, depth_sum, radii
 
     @staticmethod
@@ -122,6 +125,7 @@ class _Blend(torch.autograd.Function):
         gradients = [torch.empty_like(field) for field in fields]
         screen = fields[0].new_empty(fields[0].shape[0], 2)
         of_gates = None if gates is None else torch.empty_like(gates)
+        gathered, found = _gathered(ctx.changes, len(screen))
         with phase("splat backward"):
             status = native.load_library().splat_backward(
                 ctx.lease.workspace.handle,
@@ -130,9 +134,21 @@ class _Blend(torch.autograd.Function):
                 transmittance.data_ptr(),
                 byref(native.pointers(*cotangents)),
                 byref(native.pointers(*gradients, screen, of_gates)),
+                None if gathered is None else byref(gathered),
             )
         _raise_for(status, fields, displacements, native.CReport())
-        return *gradients, screen, of_gates, None, None, None
+        if ctx.changes is not None:
+            ctx.changes.found = RowChanges(*found)
+        return *gradients, screen, of_gates, None, None, None, None
+
+
+def _gathered(changes: LeaveOneOutSums | None, rows: int) -> tuple[Array[c_void_p] | None, tuple[Tensor, ...]]:
+    """The pointers for what a backward pass gathers beside gradients, and the tensors it writes; None: nothing."""
+    if changes is None:
+        return None, ()
+    weight, largest = torch.empty(2, rows, dtype=torch.float64)
+    found = (weight, largest, torch.empty(rows, COUNTINGS, dtype=torch.float64))
+    return native.pointers(changes.background, changes.pixel_weights, *found), found
 
 
 def _moved(gaussians: Gaussians) -> Tensor | None:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from sparsestreet.ops.raster import Raster
+from sparsestreet.ops.raster import LeaveOneOutSums, Raster, RowChanges
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype
@@ -23,6 +23,7 @@ def rasterize(
     settings: SplatSettings,
     *,
     gates: Float[Tensor, " n"] | None = None,
+    changes: LeaveOneOutSums | None = None,
 ) -> Raster:
     """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
     check_dtype(gaussians, "backend 'reference'")
@@ -44,11 +45,21 @@ def rasterize(
         for chunk in _pixel_chunks(camera, splats)
     ]
     rgb, transmittance, depth_sum = (torch.cat(part) for part in zip(*parts, strict=True))
+    if changes is not None:
+        rgb.register_hook(lambda _: _fill(changes, gaussians, camera, settings))
     radii = gaussians.means.detach().new_zeros(len(gaussians))
     if len(rows):
         radii[rows] = splats.half_boxes.amax(-1)
     shape = (camera.height, camera.width)
     return Raster(rgb.reshape(*shape, 3), transmittance.reshape(shape), depth_sum.reshape(shape), radii)
+
+
+def _fill(changes: LeaveOneOutSums, gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> None:
+    """By passes of their own, where other backends gather as they go backward."""
+    ways = [leave_one_out(gaussians, changes.background, each, camera, settings) for each in changes.pixel_weights]
+    squared = torch.stack([one.squared_change for one in ways], dim=1)
+    weight = contribution(gaussians, camera, settings).weight
+    changes.found = RowChanges(weight, ways[0].max_abs_change, squared)
 
 
 @torch.no_grad()

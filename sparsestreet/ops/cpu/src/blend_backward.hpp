@@ -7,7 +7,7 @@
 #pragma once
 #include <omp.h>
 
-#include "pixel.hpp"
+#include "changes.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -24,9 +24,10 @@ struct Columns {
   Lanes<T> s{}, sa{}, sb{}, sa_dy{}, sb_dy{}, abs_x{}, abs_y{}, red{}, green{}, blue{}, depth{}, gate{};
 };
 
-template <class T, bool GATED>
+// CHANGES: what the view would change by without the row is gathered as well (changes.hpp).
+template <class T, bool GATED, bool CHANGES>
 inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
-                           int at, T pair, Columns<T>& sums) {
+                           int at, T pair, Columns<T>& sums, TileChanges<T>& tile, ChangeColumns<T>& changes) {
   const T along = p.l21 * dy, b = p.l22 * dy, base = p.log2_opacity - b * b;
   const Sample<T> q = sample(p, dx, along, base, cuts);
   const Lanes<T> drawn = load(t.last + at) >= pair ? q.alpha : Lanes<T>{};
@@ -53,6 +54,7 @@ inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cu
   sums.green += weight * green;
   sums.blue += weight * blue;
   sums.depth += weight * depth;
+  if (CHANGES) accumulate_change(p, weight, alpha * inverse, tile, at, changes);
 }
 
 template <class T>
@@ -91,13 +93,14 @@ void load_tile(TileCotangents<T>& t, const View& view, int64_t x0, int64_t y0, c
   }
 }
 
-template <class T, bool GATED>
+template <class T, bool GATED, bool CHANGES>
 void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
-                         TileCotangents<T>& t) {
+                         TileCotangents<T>& t, TileChanges<T>& changes) {
   const int64_t begin = ws.tile_begin[tile], end = ws.tile_end[tile];
   for (int64_t k = ws.tile_begin[tile + 1] - 1; k >= end; --k) {
     ws.slots[ws.pairs[k].slot] = Slot<T>{};
     if (GATED) ws.gate_slots[ws.pairs[k].slot] = 0;
+    if (CHANGES) ws.gathered_slots[ws.pairs[k].slot] = ChangeSlot<T>{};
   }
   for (int64_t k = end - 1; k >= begin; --k) {
     if (k - PREFETCH >= begin) {
@@ -107,22 +110,28 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
     const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);
     Slot<T> slot{};
+    ChangeSlot<T> change{};
     T gate = 0;
     for (int x = 0; x < TILE; x += LANES<T>) {
       const Lanes<T> dx = load(here.dx + x);
       Columns<T> sums;
+      ChangeColumns<T> found;
       for (int y = here.first; y <= here.last; ++y)
-        accumulate_row<T, GATED>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums);
+        accumulate_row<T, GATED, CHANGES>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums,
+                                          changes, found);
       add_columns(sums, dx, slot);
       if (GATED) gate += total<T>(sums.gate);
+      if (CHANGES) add_changes(found, change);
     }
     ws.slots[ws.pairs[k].slot] = slot;
     if (GATED) ws.gate_slots[ws.pairs[k].slot] = gate;
+    if (CHANGES) ws.gathered_slots[ws.pairs[k].slot] = change;
   }
 }
 
-template <class T, bool GATED>
-void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmittance, const Layers& cotangents) {
+template <class T, bool GATED, bool CHANGES>
+void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmittance, const Layers& cotangents,
+                          const Gathered* gathered) {
   const Cuts<T> cuts(view);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
@@ -130,7 +139,9 @@ void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmitt
     TileCotangents<T> t;
     load_tile(t, view, x0, y0, transmittance, cotangents);
     std::memcpy(t.last, &ws.last_pairs[tile * PIXELS], sizeof(t.last));
-    blend_tile_backward<T, GATED>(ws, cuts, tile, x0, y0, t);
+    TileChanges<T> changes;
+    if (CHANGES) load_changes(changes, view, x0, y0, transmittance, *gathered);
+    blend_tile_backward<T, GATED, CHANGES>(ws, cuts, tile, x0, y0, t, changes);
   }
 }
 
@@ -146,15 +157,19 @@ void sum_gates(const Workspace<T>& ws, const View& view, int64_t rows, T* gates)
 
 template <class T>
 void blend_backward(Workspace<T>& ws, const View& view, const T* transmittance, const Layers& cotangents, int64_t rows,
-                    T* gates) {
+                    T* gates, const Gathered* gathered) {
   const double start = omp_get_wtime();
   ws.slots.reserve(ws.pair_count);
   if (gates) {
     ws.gate_slots.reserve(ws.pair_count);
-    blend_tiles_backward<T, true>(ws, view, transmittance, cotangents);
+    blend_tiles_backward<T, true, false>(ws, view, transmittance, cotangents, nullptr);
     sum_gates(ws, view, rows, gates);
+  } else if (gathered) {
+    ws.gathered_slots.reserve(ws.pair_count);
+    blend_tiles_backward<T, false, true>(ws, view, transmittance, cotangents, gathered);
+    sum_changes(ws, view, rows, *gathered);
   } else {
-    blend_tiles_backward<T, false>(ws, view, transmittance, cotangents);
+    blend_tiles_backward<T, false, false>(ws, view, transmittance, cotangents, nullptr);
   }
   ws.seconds[BLEND_BACKWARD] = omp_get_wtime() - start;
 }

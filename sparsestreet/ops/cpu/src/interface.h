@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 15;
+constexpr int32_t INTERFACE_VERSION = 16;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -63,6 +63,16 @@ struct Backdrop {
 // How far a view moves when a row alone is removed.
 struct Changes {
   double *largest, *squared;
+};
+
+// In how many ways squared changes are counted in one backward pass.
+constexpr int COUNTINGS = 3;
+
+// What backward gathers beside gradients: behind the splats [h,w,3], null: black; how much each pixel's squared change
+// counts [COUNTINGS,h,w]; of the rows, sums of blend weights [n], largest changes [n], squared changes [n,COUNTINGS].
+struct Gathered {
+  const void *background, *pixel_weights;
+  double *weight, *largest, *squared;
 };
 
 // A cube map behind an image, and the camera that sees it; pointers to float or double.

@@ -18,9 +18,10 @@ struct RowKernels {
 
 struct PixelKernels {
   void (*blend)(void*, const View&, bool gated, const Layers&);
-  // `gates`: where the gradients of the gates of all `rows` go; null: there are none.
+  // `gates`: where the gradients of the gates of all `rows` go; `gathered`: what else is gathered; null: there are none.
+  // Not both.
   void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents, int64_t rows,
-                         void* gates);
+                         void* gates, const Gathered* gathered);
   void (*count)(void*, const View&, int64_t rows, const Counters&);
   void (*remove)(void*, const View&, int64_t rows, const Backdrop&, const Changes&);
 };

@@ -140,9 +140,10 @@ SPLAT_API int32_t splat_forward(Handle* h, const View* view, const Rows* rows, c
 
 // Uses what splat_forward left in the workspace; null pointers in `cotangents` stand for zeros.
 SPLAT_API int32_t splat_backward(Handle* h, const View* view, const Rows* rows, const void* transmittance,
-                                 const Layers* cotangents, const RowGradients* gradients) {
+                                 const Layers* cotangents, const RowGradients* gradients, const Gathered* gathered) {
   return guarded([&]() -> int32_t {
-    h->pixels().blend_backward(h->workspace, *view, transmittance, *cotangents, rows->count, gradients->gates);
+    h->pixels().blend_backward(h->workspace, *view, transmittance, *cotangents, rows->count, gradients->gates,
+                               gathered);
     h->rows().project_backward(h->workspace, *view, *rows, *gradients);
     return OK;
   });
