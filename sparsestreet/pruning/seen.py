@@ -11,7 +11,7 @@ from sparsestreet.data.lazy import Frames
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.scene.gaussians import InstanceFloors, RowPlan
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes import Node
+from sparsestreet.scene.nodes import Instances, Node
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
 
@@ -38,24 +38,24 @@ class InstanceAreas:
     def __init__(self, nodes: Mapping[str, Node]) -> None:
         self._nodes = dict(nodes)
         objects = {name: node.instances() for name, node in nodes.items() if node.settings.min_instance_gaussians > 0}
-        self._instances = {name: instances for name, instances in objects.items() if instances is not None}
         self._pixels: dict[str, Tensor] = {
-            name: torch.zeros(len(each.names), dtype=torch.float64, device=each.ids.device)
-            for name, each in self._instances.items()
+            name: torch.zeros(len(instances.names), dtype=torch.float64, device=instances.ids.device)
+            for name, instances in objects.items()
+            if instances is not None
         }
 
     @property
     def needed(self) -> bool:
         """Whether any instance has a floor of its own."""
-        return bool(self._instances)
+        return bool(self._pixels)
 
     def add(self, weight: Float64[Tensor, " n"], spans: Mapping[str, slice]) -> None:
         """Add one view of the whole scene: the blend weights of all rows, summed over its pixels.
 
         ``spans``: name of a node -> its rows."""
-        for name, instances in self._instances.items():
-            largest = self._pixels[name]
-            filled = torch.zeros_like(largest).index_add(0, instances.ids, weight[spans[name]].to(largest))
+        for name, largest in self._pixels.items():
+            ids = self._instances(name).ids
+            filled = torch.zeros_like(largest).index_add(0, ids, weight[spans[name]].to(largest))
             self._pixels[name] = torch.maximum(largest, filled)
 
     def clear(self) -> None:
@@ -80,10 +80,10 @@ class InstanceAreas:
         }
 
     def _of_instances(self, name: str) -> InstanceFloors | None:
-        instances = self._instances.get(name)
-        if instances is None:
+        pixels = self._pixels.get(name)
+        if pixels is None:
             return None
-        pixels = self._pixels[name]
+        instances = self._instances(name)
         if not pixels.isfinite().all():
             index = int((~pixels.isfinite()).nonzero()[0])
             raise ValueError(
@@ -92,6 +92,12 @@ class InstanceAreas:
             )
         least = (self._nodes[name].settings.min_instance_gaussians * pixels / 1000).ceil().long()
         return InstanceFloors(instances.ids, torch.minimum(least, instances.counts()))
+
+    def _instances(self, name: str) -> Instances:
+        """As they are now: rows may go between two views."""
+        instances = self._nodes[name].instances()
+        assert instances is not None  # it had some when areas were begun
+        return instances
 
 
 REGIONS = 3

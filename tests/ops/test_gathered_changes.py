@@ -56,20 +56,20 @@ def backward(
 
 @every_fast_precision
 @pytest.mark.parametrize(("stop", "size"), [("inclusive", (37, 53)), ("exclusive", (64, 17)), ("inclusive", (1, 1))])
-def test_a_backward_pass_gathers_what_leave_one_out_and_contribution_say(size, stop, backend, dtype):
+def test_a_backward_pass_gathers_what_leave_one_out_and_contribution_say(size, stop, backend, dtype, monkeypatch):
     interpreted = backend == "triton"
     view = camera(*((17, 13) if interpreted else size), focal=40.0)
     settings, device = STOPS[stop], device_of(backend)
     given = cast(random_gaussians(12 if interpreted else 300, view, seed=2), dtype, requires_grad=True, device=device)
     sums = asked(view, given.means)
-    fill_buffers_with_nan()
+    fill_buffers_with_nan(monkeypatch)
     backward(given, view, backend, settings, sums)
     assert sums.found is not None
     apart = [
         leave_one_out(given, view, background=sums.background, pixel_weights=each, settings=settings, backend=backend)
         for each in sums.pixel_weights
     ]
-    assert float(apart[0].squared_change.sum()) > 0.01
+    assert float(apart[0].squared_change.sum()) > 0.005
     torch.testing.assert_close(sums.found.max_abs_change, apart[0].max_abs_change, **CLOSE[dtype])
     squared = torch.stack([one.squared_change for one in apart], 1)
     torch.testing.assert_close(sums.found.squared_change, squared, **CLOSE[dtype])
@@ -119,8 +119,8 @@ def test_bad_requests_are_refused():
     given = random_gaussians(3, view)
     good = asked(view, given.means)
     for sums, said in (
-        (replace(good, pixel_weights=good.pixel_weights[0]), "pixel_weights must be"),
-        (replace(good, background=torch.ones(3).double()), "background must be"),
+        (LeaveOneOutSums(good.pixel_weights[:, 1:]), "pixel_weights must be"),
+        (LeaveOneOutSums(good.pixel_weights, torch.ones(4, 5, 3)), "background must be"),
     ):
         with pytest.raises(ValueError, match=said):
             splat(given, view, changes=sums)

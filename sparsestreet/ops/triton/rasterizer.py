@@ -98,7 +98,8 @@ def _remove(
 ) -> tuple[Tensor, Tensor]:
     """Largest change of each row, and its sums of slots; three layers of weights: those of LeaveOneOutSums."""
     three, lists, passed = pixel_weights is not None and pixel_weights.dim() == 3, screen.lists, ends.transmittance
-    changes = passed.new_empty(len(lists.slots), GATHERED_COUNT if three else CHANGE_COUNT)
+    pairs = lists.sizes.pairs  # the tables may have room for more
+    changes = passed.new_empty(pairs, GATHERED_COUNT if three else CHANGE_COUNT)
     behind, counts = contiguous(background), contiguous(pixel_weights)
     launch(
         remove_from_tiles, len(lists.order), 1,
@@ -110,7 +111,8 @@ def _remove(
     _sum_slots(changes, lists, totals, 8 if three else 2, tl.float64)
     # A maximum is the same in any order.
     largest = torch.zeros_like(totals[:, 0])
-    largest.scatter_reduce_(0, lists.rows_of_pairs.long(), changes[lists.slots, 0].double(), "amax")
+    of_pairs = changes[lists.slots[:pairs], 0].double()
+    largest.scatter_reduce_(0, lists.rows_of_pairs[:pairs].long(), of_pairs, "amax")
     return largest, totals
 
 

@@ -105,7 +105,7 @@ class Pruning(Callback, RowListener):
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         self._ranks = ranks_of(trainer)
 
-    def on_train_batch_start(self, trainer: Trainer, pl_module: StreetSystem, batch: Frame, batch_idx: int) -> None:
+    def on_train_batch_start(self, trainer: Trainer, pl_module: StreetSystem, batch: object, batch_idx: int) -> None:
         if not self.rule.gathers:
             return
         step, course = trainer.global_step, pl_module.course
@@ -115,9 +115,10 @@ class Pruning(Callback, RowListener):
             self._draws = data_of(trainer).last_draws(moment * accumulated) if moment else frozenset()
             self._moment, self._gathered = moment, self._begin(pl_module, moment)
         gathers = accumulated * step + batch_idx % accumulated in self._draws
+        # On small images there is less of everything to sum.
         whole = pl_module.resolution.divisor(step, course) == 1
-        self._frame = batch if gathers and whole else None
-        pl_module.pixel_weights = None if self._frame is None else regions(batch)
+        self._frame = batch if gathers and whole and isinstance(batch, Frame) else None
+        pl_module.pixel_weights = None if self._frame is None else regions(self._frame)
 
     def on_after_backward(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if self._frame is not None and self._gathered is not None and pl_module.rendering is not None:

@@ -39,7 +39,7 @@ inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cu
   const Lanes<T> light = p.color[0] * red + p.color[1] * green + p.color[2] * blue + p.depth * depth;
   const Lanes<T> blended = weight * light;
   store(t.behind + at, behind + blended);
-  Lanes<T> s = blended - alpha * inverse * behind;
+  Lanes<T> s = apart(blended) - alpha * inverse * behind;
   s = q.raw <= cuts.alpha_max ? s : Lanes<T>{};  // a clamped alpha has no derivative
   if (GATED) sums.gate += drawn * (transmittance * light - inverse * behind);
   const Lanes<T> sa = s * q.a, sb = s * b;
@@ -54,7 +54,7 @@ inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cu
   sums.green += weight * green;
   sums.blue += weight * blue;
   sums.depth += weight * depth;
-  if (CHANGES) accumulate_change(p, weight, alpha * inverse, tile, at, changes);
+  if (CHANGES) accumulate_change(p, apart(weight), apart(alpha) * apart(inverse), tile, at, changes);
 }
 
 template <class T>

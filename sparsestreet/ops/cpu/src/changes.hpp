@@ -18,6 +18,17 @@ struct ChangeColumns {
   Lanes<T> weight{}, largest{}, squared[COUNTINGS]{};
 };
 
+// The same number, behind which the compiler sees no formula: what is shared with the formulas of gradients would let it
+// regroup these, and their bits would depend on whether changes are gathered.
+template <class V>
+inline V apart(const V& value) {
+#if defined(__clang__)
+  return __arithmetic_fence(value);
+#else
+  return __builtin_assoc_barrier(value);
+#endif
+}
+
 template <class T>
 inline void accumulate_change(const Splat<T>& p, const Lanes<T>& weight, const Lanes<T>& through, TileChanges<T>& t,
                               int at, ChangeColumns<T>& sums) {
