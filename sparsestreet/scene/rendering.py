@@ -247,6 +247,5 @@ def _drawn(
 def _asked(
     scene: SceneGraph, view: View, pixel_weights: Float[Tensor, "3 h w"]
 ) -> tuple[LeaveOneOutSums, LinearizedEffects]:
-    with phase("changes"):
-        effects = linearized(scene.effects.values(), view)
-        return LeaveOneOutSums(effects.weights(pixel_weights), effects.background), effects
+    effects = linearized(scene.effects.values(), view)
+    return LeaveOneOutSums(effects.weights(pixel_weights), effects.background), effects

@@ -7,7 +7,7 @@ from typing import Any
 from lightning import Callback, Trainer
 
 from sparsestreet.data.lazy import as_frames
-from sparsestreet.phases import phase, stage
+from sparsestreet.phases import stage
 from sparsestreet.pruning import Gathered, PruningRule, RenderContext, regions
 from sparsestreet.ranks import ALONE
 from sparsestreet.records.curves import CountChange
@@ -122,8 +122,7 @@ class Pruning(Callback, RowListener):
 
     def on_after_backward(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if self._frame is not None and self._gathered is not None and pl_module.rendering is not None:
-            with phase("changes"):
-                self._gathered.add(self._frame, pl_module.rendering)
+            self._gathered.add(self._frame, pl_module.rendering)
 
     def on_rows_changed(self, change: CountChange, plan: RowPlan) -> None:
         if self._gathered is not None:

@@ -39,7 +39,7 @@ inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cu
   const Lanes<T> light = p.color[0] * red + p.color[1] * green + p.color[2] * blue + p.depth * depth;
   const Lanes<T> blended = weight * light;
   store(t.behind + at, behind + blended);
-  Lanes<T> s = apart(blended) - alpha * inverse * behind;
+  Lanes<T> s = blended - alpha * inverse * behind;
   s = q.raw <= cuts.alpha_max ? s : Lanes<T>{};  // a clamped alpha has no derivative
   if (GATED) sums.gate += drawn * (transmittance * light - inverse * behind);
   const Lanes<T> sa = s * q.a, sb = s * b;
@@ -68,7 +68,7 @@ inline T total(const Lanes<T>& values) {
 template <class T>
 inline void add_columns(const Columns<T>& c, const Lanes<T>& dx, Slot<T>& slot) {
   slot.s += total<T>(c.s), slot.sa += total<T>(c.sa), slot.sb += total<T>(c.sb);
-  slot.sa_dx += total<T>(c.sa * dx);  // dx is the same in every row of a column
+  slot.sa_dx += total<T>(apart(c.sa * dx));  // dx is the same in every row of a column
   slot.sa_dy += total<T>(c.sa_dy), slot.sb_dy += total<T>(c.sb_dy);
   slot.abs_x += total<T>(c.abs_x), slot.abs_y += total<T>(c.abs_y);
   slot.color[0] += total<T>(c.red), slot.color[1] += total<T>(c.green), slot.color[2] += total<T>(c.blue);
@@ -107,7 +107,7 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
       __builtin_prefetch(&ws.splats[ws.pairs[k - PREFETCH].row]);
       __builtin_prefetch(&ws.slots[ws.pairs[k - PREFETCH].slot], 1);
     }
-    const Splat<T>& s = ws.splats[ws.pairs[k].row];
+    const Splat<T> s = ws.splats[ws.pairs[k].row];  // a copy: no store to the tile can change it
     const TileSplat<T> here(s, x0, y0);
     Slot<T> slot{};
     ChangeSlot<T> change{};
