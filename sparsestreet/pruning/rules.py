@@ -141,8 +141,7 @@ class LeaveOneOutRule(PruningRule):
         errors = sum((_errors(scene, frame, context) for frame in on_device(scene, frames, ranks)), seen.errors)
         # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
         share = 1 / ranks.sum(errors.clone()).clamp(min=MIN_ERROR)
-        rows = torch.cat([seen.rows[name] for name in scene.nodes])
-        largest, squared = rows[:, 0].clone(), rows[:, 1:] @ share
+        largest, squared = seen.largest.clone(), seen.squared @ share
         for frame in on_device(scene, frames, ranks):
             for view, weights in self._seen(frame, share.float()):
                 change = _without_each(scene, view, weights, context)

@@ -116,8 +116,8 @@ def regions(frame: Frame) -> Float[Tensor, "3 h w"]:
 
 def squared_errors(rgb: Float[Tensor, "h w 3"], frame: Frame) -> Float64[Tensor, "3"]:
     """Return the squared error of an image of one frame, summed over pixels and channels, for each of its regions."""
-    squared = (rgb.clamp(0, 1) - frame.image.to(rgb) / 255).double().square().sum(-1)
-    return (regions(frame).double() * squared).sum((1, 2))
+    squared = (rgb.clamp(0, 1) - frame.image.to(rgb) / 255).square().sum(-1).double()
+    return regions(frame).double().flatten(1) @ squared.flatten()
 
 
 class Gathered:
@@ -135,10 +135,12 @@ class Gathered:
         self.views: set[tuple[int, int]] = set()
         """Frame and camera index of what was seen."""
         self.errors = torch.zeros(REGIONS, dtype=torch.float64, device=scene.device)
-        self.rows: dict[str, Float64[Tensor, "_ 4"]] = {
-            name: self.errors.new_zeros(count, 1 + REGIONS) for name, count in scene.counts().items()
-        }
-        """Name of a node -> of each row the largest change of any pixel, then the squared change in each region."""
+        self.counts = scene.counts()
+        rows = sum(self.counts.values())
+        self.largest: Float64[Tensor, " n"] = self.errors.new_zeros(rows)
+        """Largest change of any pixel, of the rows of all nodes in their order."""
+        self.squared: Float64[Tensor, "n r"] = self.errors.new_zeros(rows, REGIONS)
+        """Squared change in each region."""
 
     @torch.no_grad()
     def add(self, frame: Frame, rendering: SceneRendering) -> None:
@@ -149,11 +151,8 @@ class Gathered:
         found = sums.found
         self.views.add(frame.indices)
         self.errors += squared_errors(rendering.rgb, frame)
-        largest = effects.most(found.max_abs_change)
-        for name, span in rendering.spans.items():
-            rows = self.rows[name]
-            torch.maximum(rows[:, 0], largest[span], out=rows[:, 0])
-            rows[:, 1:] += found.squared_change[span]
+        torch.maximum(self.largest, effects.most(found.max_abs_change), out=self.largest)
+        self.squared += found.squared_change
         self.areas.add(found.weight, rendering.spans)
 
     def resize(self, name: str, plan: RowPlan) -> None:
@@ -162,8 +161,10 @@ class Gathered:
             self.views.clear()
             self.errors.zero_()
             self.areas.clear()
-            self.rows = {node: torch.zeros_like(rows) for node, rows in self.rows.items()}
-        self.rows[name] = self.rows[name][plan.source]
+            self.largest.zero_()
+            self.squared.zero_()
+        self.largest, self.squared = (self._resized(rows, name, plan) for rows in (self.largest, self.squared))
+        self.counts[name] = len(plan.source)
 
     def rest(self, frames: Frames, ranks: Ranks = ALONE) -> Frames:
         """Return the frames that no process has seen."""
@@ -172,18 +173,21 @@ class Gathered:
 
     def state_dict(self, ranks: Ranks = ALONE) -> dict[str, Any]:
         """Return what all processes have seen together, for one of them to go on with."""
-        together = {name: rows.clone() for name, rows in self.rows.items()}
-        for rows in together.values():
-            rows[:, 0], rows[:, 1:] = ranks.largest(rows[:, 0].clone()), ranks.sum(rows[:, 1:].clone())
         return {
             "views": set().union(*ranks.gathered(self.views)),
             "errors": ranks.sum(self.errors.clone()),
-            "rows": together,
+            "largest": ranks.largest(self.largest.clone()),
+            "squared": ranks.sum(self.squared.clone()),
             "areas": self.areas.state_dict(ranks),
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.views = set(state["views"])
-        self.errors = state["errors"].to(self.errors.device)
-        self.rows = {name: rows.to(self.errors.device) for name, rows in state["rows"].items()}
+        self.errors, self.largest, self.squared = (
+            state[name].to(self.errors.device) for name in ("errors", "largest", "squared")
+        )
         self.areas.load_state_dict(state["areas"])
+
+    def _resized(self, rows: Tensor, name: str, plan: RowPlan) -> Tensor:
+        parts = dict(zip(self.counts, rows.split(list(self.counts.values())), strict=True))
+        return torch.cat(list((parts | {name: parts[name][plan.source]}).values()))

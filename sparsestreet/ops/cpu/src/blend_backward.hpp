@@ -24,8 +24,8 @@ struct Columns {
   Lanes<T> s{}, sa{}, sb{}, sa_dy{}, sb_dy{}, abs_x{}, abs_y{}, red{}, green{}, blue{}, depth{}, gate{};
 };
 
-// CHANGES: what the view would change by without the row is gathered as well (changes.hpp).
-template <class T, bool GATED, bool CHANGES>
+// WAYS > 0: what the view would change by without the row is gathered as well, counted so many ways (changes.hpp).
+template <class T, bool GATED, int WAYS>
 inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
                            int at, T pair, Columns<T>& sums, TileChanges<T>& tile, ChangeColumns<T>& changes) {
   const T along = p.l21 * dy, b = p.l22 * dy, base = p.log2_opacity - b * b;
@@ -54,15 +54,7 @@ inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cu
   sums.green += weight * green;
   sums.blue += weight * blue;
   sums.depth += weight * depth;
-  if (CHANGES) accumulate_change(p, apart(weight), apart(alpha) * apart(inverse), tile, at, changes);
-}
-
-template <class T>
-inline T total(const Lanes<T>& values) {
-  T each[LANES<T>], sum = 0;
-  store(each, values);
-  for (int i = 0; i < LANES<T>; ++i) sum += each[i];
-  return sum;
+  if (WAYS) accumulate_change<T, WAYS>(p, apart(weight), apart(alpha) * apart(inverse), tile, at, changes);
 }
 
 template <class T>
@@ -93,14 +85,14 @@ void load_tile(TileCotangents<T>& t, const View& view, int64_t x0, int64_t y0, c
   }
 }
 
-template <class T, bool GATED, bool CHANGES>
+template <class T, bool GATED, int WAYS>
 void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
                          TileCotangents<T>& t, TileChanges<T>& changes) {
   const int64_t begin = ws.tile_begin[tile], end = ws.tile_end[tile];
   for (int64_t k = ws.tile_begin[tile + 1] - 1; k >= end; --k) {
     ws.slots[ws.pairs[k].slot] = Slot<T>{};
     if (GATED) ws.gate_slots[ws.pairs[k].slot] = 0;
-    if (CHANGES) ws.gathered_slots[ws.pairs[k].slot] = ChangeSlot<T>{};
+    if (WAYS) ws.gathered_slots[ws.pairs[k].slot] = ChangeSlot<T>{};
   }
   for (int64_t k = end - 1; k >= begin; --k) {
     if (k - PREFETCH >= begin) {
@@ -117,15 +109,15 @@ void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, in
       Columns<T> sums;
       ChangeColumns<T> found;
       for (int y = here.first; y <= here.last; ++y)
-        accumulate_row<T, GATED, CHANGES>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums,
+        accumulate_row<T, GATED, WAYS>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums,
                                           changes, found);
       add_columns(sums, dx, slot);
       if (GATED) gate += total<T>(sums.gate);
-      if (CHANGES) add_changes(found, change);
+      if (WAYS) add_changes<T, WAYS>(found, change);
     }
     ws.slots[ws.pairs[k].slot] = slot;
     if (GATED) ws.gate_slots[ws.pairs[k].slot] = gate;
-    if (CHANGES) ws.gathered_slots[ws.pairs[k].slot] = change;
+    if (WAYS) ws.gathered_slots[ws.pairs[k].slot] = change;
   }
 }
 
@@ -140,8 +132,11 @@ void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmitt
     load_tile(t, view, x0, y0, transmittance, cotangents);
     std::memcpy(t.last, &ws.last_pairs[tile * PIXELS], sizeof(t.last));
     TileChanges<T> changes;
-    if (CHANGES) load_changes(changes, view, x0, y0, transmittance, *gathered);
-    blend_tile_backward<T, GATED, CHANGES>(ws, cuts, tile, x0, y0, t, changes);
+    const int ways = CHANGES ? load_changes(changes, view, x0, y0, transmittance, *gathered) : 0;
+    if (ways > 1)
+      blend_tile_backward<T, GATED, CHANGES ? COUNTINGS : 0>(ws, cuts, tile, x0, y0, t, changes);
+    else
+      blend_tile_backward<T, GATED, CHANGES ? 1 : 0>(ws, cuts, tile, x0, y0, t, changes);
   }
 }
 

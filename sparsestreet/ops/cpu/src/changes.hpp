@@ -12,7 +12,7 @@ struct TileChanges {
   alignas(64) T behind[3][PIXELS], weights[COUNTINGS][PIXELS];
 };
 
-// Sums over the rows of a tile, per column.
+// Sums over the rows of a tile, per column. WAYS: how many countings weigh any pixel of the tile; the others are 0.
 template <class T>
 struct ChangeColumns {
   Lanes<T> weight{}, largest{}, squared[COUNTINGS]{};
@@ -29,7 +29,7 @@ inline V apart(const V& value) {
 #endif
 }
 
-template <class T>
+template <class T, int WAYS>
 inline void accumulate_change(const Splat<T>& p, const Lanes<T>& weight, const Lanes<T>& through, TileChanges<T>& t,
                               int at, ChangeColumns<T>& sums) {
   Lanes<T> square{};
@@ -40,32 +40,52 @@ inline void accumulate_change(const Splat<T>& p, const Lanes<T>& weight, const L
     sums.largest = larger(sums.largest, magnitude(change));
     square += change * change;
   }
-  for (int i = 0; i < COUNTINGS; ++i) sums.squared[i] += load(t.weights[i] + at) * square;
+  for (int i = 0; i < WAYS; ++i) sums.squared[i] += load(t.weights[i] + at) * square;
   sums.weight += weight;
 }
 
 template <class T>
-inline void add_changes(const ChangeColumns<T>& c, ChangeSlot<T>& slot) {
-  for (int i = 0; i < LANES<T>; ++i) {
-    slot.weight += c.weight[i];
-    slot.largest = c.largest[i] > slot.largest ? c.largest[i] : slot.largest;
-    for (int k = 0; k < COUNTINGS; ++k) slot.squared[k] += c.squared[k][i];
-  }
+inline T total(const Lanes<T>& values) {
+  T each[LANES<T>], sum = 0;
+  store(each, values);
+  for (int i = 0; i < LANES<T>; ++i) sum += each[i];
+  return sum;
 }
 
-// Behind the last splat there is what the background sends through all of them.
 template <class T>
-void load_changes(TileChanges<T>& t, const View& view, int64_t x0, int64_t y0, const T* passed, const Gathered& of) {
+inline T most(const Lanes<T>& values) {
+  T each[LANES<T>], largest = 0;
+  store(each, values);
+  for (int i = 0; i < LANES<T>; ++i) largest = each[i] > largest ? each[i] : largest;
+  return largest;
+}
+
+template <class T, int WAYS>
+inline void add_changes(const ChangeColumns<T>& c, ChangeSlot<T>& slot) {
+  const T largest = most<T>(c.largest);
+  slot.weight += total<T>(c.weight), slot.largest = largest > slot.largest ? largest : slot.largest;
+  for (int i = 0; i < WAYS; ++i) slot.squared[i] += total<T>(c.squared[i]);
+}
+
+// Behind the last splat there is what the background sends through all of them. Answers up to which counting any pixel
+// of the tile has a weight: few tiles show all that is told apart.
+template <class T>
+int load_changes(TileChanges<T>& t, const View& view, int64_t x0, int64_t y0, const T* passed, const Gathered& of) {
   std::memset(static_cast<void*>(&t), 0, sizeof(t));
   const T *background = static_cast<const T*>(of.background), *weights = static_cast<const T*>(of.pixel_weights);
+  int ways = 1;
   for (int64_t y = y0; y < y0 + TILE && y < view.height; ++y) {
     for (int64_t x = x0; x < x0 + TILE && x < view.width; ++x) {
       const int64_t to = (y - y0) * TILE + x - x0, from = y * view.width + x;
-      for (int i = 0; i < COUNTINGS; ++i) t.weights[i][to] = weights[i * view.height * view.width + from];
+      for (int i = 0; i < COUNTINGS; ++i) {
+        t.weights[i][to] = weights[i * view.height * view.width + from];
+        if (t.weights[i][to] != 0 && i >= ways) ways = i + 1;
+      }
       for (int channel = 0; background && channel < 3; ++channel)
         t.behind[channel][to] = passed[from] * background[3 * from + channel];
     }
   }
+  return ways;
 }
 
 // The slots of each row, in a fixed order; 0 where it was culled.
