@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
-from jaxtyping import Float, Float64
+from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.demand import DemandError
+from sparsestreet.types import LeaveOneOut
 
 MIN_ALPHA = 1e-6
 """Depth is divided by alpha, or by this where a pixel is emptier."""
@@ -47,29 +48,17 @@ COUNTINGS = 3
 """In how many ways squared changes are counted in one backward pass."""
 
 
-@dataclass(frozen=True)
-class RowChanges:
-    """How far one view changes without each row, and what the row adds to it."""
-
-    weight: Float64[Tensor, " n"]
-    """Sum of blend weights over the pixels, as ``Contribution`` has it."""
-    max_abs_change: Float64[Tensor, " n"]
-    """As ``LeaveOneOut`` has it."""
-    squared_change: Float64[Tensor, "n 3"]
-    """Sum over pixels and channels of the squared change times each of the pixel's three weights."""
-
-
 @dataclass
 class LeaveOneOutSums:
     """What the backward pass of a view finds out beside its gradients: how far the view changes without each row.
 
-    It comes by -alpha dC/dalpha anyway, which ``leave_one_out`` computes in a pass of its own; both agree up to
-    rounding.
+    The same as ``leave_one_out`` says, but lists and image of the rendering are there already: that leaves one loop
+    over the pixels.
     """
 
     pixel_weights: Float[Tensor, "3 h w"]
     """How much the squared change of each pixel counts, in three ways."""
     background: Float[Tensor, "h w 3"] | None = None
     """Light behind the splats; None: black."""
-    found: RowChanges | None = None
+    found: LeaveOneOut | None = None
     """None until the backward pass has run."""

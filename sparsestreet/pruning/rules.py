@@ -122,29 +122,31 @@ class LeaveOneOutRule(PruningRule):
 
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
-        if context.gathered is not None:
-            frames = context.gathered.rest(as_frames(frames), context.ranks)
-        costs, floors = self.costs(scene, frames, context), self.floors(scene, frames, context)
+        seen = context.gathered or Gathered(scene, self.areas(scene))
+        costs = self.costs(scene, seen.rest(as_frames(frames), context.ranks), context, seen)
+        floors = seen.areas.floors(context.ranks)
         if self.keep is not None:
             return keep_counts(costs, self.keep, floors, context)
         return keep_by_cost({name: costs[name] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
 
     @torch.no_grad()
     def costs(
-        self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
+        self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext, seen: Gathered | None = None
     ) -> dict[str, Float64[Tensor, " _"]]:
         """Return name of a node -> the cost of each of its rows, relative to the present squared error.
 
-        ``frames``: those that training steps have not gathered.
+        ``seen``: what training steps have gathered of other views than these; it gets the areas that these show.
         """
-        ranks, seen = context.ranks, context.gathered or Gathered(scene, self.areas(scene))
+        ranks, seen = context.ranks, seen or Gathered(scene, self.areas(scene))
         errors = sum((_errors(scene, frame, context) for frame in on_device(scene, frames, ranks)), seen.errors)
         # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
         share = 1 / ranks.sum(errors.clone()).clamp(min=MIN_ERROR)
         largest, squared = seen.largest.clone(), seen.squared @ share
         for frame in on_device(scene, frames, ranks):
             for view, weights in self._seen(frame, share.float()):
-                change = _without_each(scene, view, weights, context)
+                change, spans = _without_each(scene, view, weights, context)
+                if view is frame:
+                    seen.areas.add(change.weight, spans)
                 largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         largest, squared = ranks.largest(largest), ranks.sum(squared)
         costs = torch.where(largest > self.noticeable, squared, 0.0)
@@ -160,8 +162,13 @@ class LeaveOneOutRule(PruningRule):
             yield replace(frame, camera=camera), share[0].expand(frame.image.shape[:2])
 
 
-def _without_each(scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], context: RenderContext) -> LeaveOneOut:
-    """Return the change without each row, after the effects, with the weights of squared changes of the pixels."""
+def _without_each(
+    scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], context: RenderContext
+) -> tuple[LeaveOneOut, dict[str, slice]]:
+    """Return the change without each row, after the effects, with weights of squared changes of the pixels.
+
+    Also name of a node -> its rows.
+    """
     placed = scene.gaussians_at(view, context.state)
     effects = linearized(scene.effects.values(), placed.view)
     change = leave_one_out(
@@ -172,7 +179,7 @@ def _without_each(scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], 
         settings=context.options.settings,
         backend=context.options.backend,
     )
-    return replace(change, max_abs_change=effects.most(change.max_abs_change))
+    return replace(change, max_abs_change=effects.most(change.max_abs_change)), placed.spans
 
 
 def _errors(scene: SceneGraph, frame: Frame, context: RenderContext) -> Float64[Tensor, "3"]:

@@ -66,10 +66,9 @@ class PruningRule(ABC):
     def floors(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Floors]:
         """Return name of every node that the rule touches -> its floors; render only if instances have floors.
 
-        ``frames``: all that were not gathered. A rule that needs ``contributions`` anyway adds them to its own
-        ``areas`` instead.
+        A rule that needs the blend weights of rows anyway adds them to its own ``areas`` instead.
         """
-        areas = self.areas(scene) if context.gathered is None else context.gathered.areas
+        areas = self.areas(scene)
         if areas.needed:
             for view, spans in contributions(scene, frames, context):
                 areas.add(view.weight, spans)

@@ -11,7 +11,7 @@ from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.lenses import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
-from sparsestreet.ops.raster import COUNTINGS, LeaveOneOutSums, PairLimitError, Raster, RowChanges
+from sparsestreet.ops.raster import COUNTINGS, LeaveOneOutSums, PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype, check_values
 from sparsestreet.phases import phase
@@ -19,7 +19,7 @@ from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 PAIR_LIMIT = 1 << 28
 """Most (splat, tile) pairs of one rendering. A pair takes 24 bytes forward and 48 more backward in float32, and
-20 where changes are gathered.
+40 where changes are gathered.
 
 In float64 it takes 32 and 96. Buffers that have just grown are a quarter larger: up to 24 GB in float32."""
 
@@ -64,11 +64,11 @@ def leave_one_out(
     settings: SplatSettings,
 ) -> LeaveOneOut:
     """How much the view changes when each row alone is removed."""
-    largest, squared = torch.empty(2, len(gaussians), dtype=torch.float64)
+    largest, squared, weight = torch.empty(3, len(gaussians), dtype=torch.float64)
     behind, counts = (None if layer is None else layer.detach().contiguous() for layer in (background, pixel_weights))
-    backdrop, changes = native.pointers(behind, counts), native.pointers(largest, squared)
+    backdrop, changes = native.pointers(behind, counts), native.pointers(largest, squared, weight)
     _measure("splat_leave_one_out", gaussians, camera, settings, backdrop, changes)
-    return LeaveOneOut(largest, squared)
+    return LeaveOneOut(largest, squared, weight)
 
 
 def _measure(
@@ -114,19 +114,18 @@ class _Blend(torch.autograd.Function):
         )
         _raise_for(status, fields, displacements, report)
         ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(*fields, gates, displacements, transmittance)
+        ctx.save_for_backward(*fields, gates, displacements, transmittance, None if changes is None else rgb)
         ctx.view, ctx.lease, ctx.changes = view, lease, changes
         return rgb, transmittance, depth_sum, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
-        *fields, gates, displacements, transmittance = ctx.saved_tensors
+        *fields, gates, displacements, transmittance, rgb = ctx.saved_tensors
         cotangents = [None if v is None else v.contiguous() for v in (v_rgb, v_transmittance, v_depth_sum)]
         gradients = [torch.empty_like(field) for field in fields]
         screen = fields[0].new_empty(fields[0].shape[0], 2)
         of_gates = None if gates is None else torch.empty_like(gates)
-        gathered, found = _gathered(ctx.changes, len(screen))
         with phase("splat backward"):
             status = native.load_library().splat_backward(
                 ctx.lease.workspace.handle,
@@ -135,21 +134,32 @@ class _Blend(torch.autograd.Function):
                 transmittance.data_ptr(),
                 byref(native.pointers(*cotangents)),
                 byref(native.pointers(*gradients, screen, of_gates)),
-                None if gathered is None else byref(gathered),
             )
         _raise_for(status, fields, displacements, native.CReport())
         if ctx.changes is not None:
-            ctx.changes.found = RowChanges(*found)
+            ctx.changes.found = _gathered(ctx.lease, ctx.view, ctx.changes, len(screen), rgb, transmittance)
         return *gradients, screen, of_gates, None, None, None, None
 
 
-def _gathered(changes: LeaveOneOutSums | None, rows: int) -> tuple[Array[c_void_p] | None, tuple[Tensor, ...]]:
-    """The pointers for what a backward pass gathers beside gradients, and the tensors it writes; None: nothing."""
-    if changes is None:
-        return None, ()
-    weight, largest = torch.empty(2, rows, dtype=torch.float64)
-    found = (weight, largest, torch.empty(rows, COUNTINGS, dtype=torch.float64))
-    return native.pointers(changes.background, changes.pixel_weights, *found), found
+def _gathered(
+    lease: Lease, view: native.CView, changes: LeaveOneOutSums, rows: int, rgb: Tensor, transmittance: Tensor
+) -> LeaveOneOut:
+    """What the lists and the image of a rendering say of its rows: half of ``leave_one_out``, as both are there."""
+    largest, weight = torch.empty(2, rows, dtype=torch.float64)
+    squared = torch.empty(rows, COUNTINGS, dtype=torch.float64)
+    behind, weights = (None if one is None else one.contiguous() for one in (changes.background, changes.pixel_weights))
+    with phase("splat backward"):
+        status = native.load_library().splat_gather(
+            lease.workspace.handle,
+            byref(view),
+            rows,
+            byref(native.pointers(rgb, transmittance, None)),
+            byref(native.pointers(behind, weights)),
+            byref(native.pointers(largest, squared, weight)),
+        )
+    if status != native.STATUS_OK:
+        raise MemoryError("no memory for the changes of the splat op: render a smaller image or fewer rows")
+    return LeaveOneOut(largest, squared, weight)
 
 
 def _moved(gaussians: Gaussians) -> Tensor | None:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from sparsestreet.ops.raster import LeaveOneOutSums, Raster, RowChanges
+from sparsestreet.ops.raster import LeaveOneOutSums, Raster
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype
@@ -58,8 +58,7 @@ def _fill(changes: LeaveOneOutSums, gaussians: Gaussians, camera: Camera, settin
     """By passes of their own, where other backends gather as they go backward."""
     ways = [leave_one_out(gaussians, changes.background, each, camera, settings) for each in changes.pixel_weights]
     squared = torch.stack([one.squared_change for one in ways], dim=1)
-    weight = contribution(gaussians, camera, settings).weight
-    changes.found = RowChanges(weight, ways[0].max_abs_change, squared)
+    changes.found = replace(ways[0], squared_change=squared)
 
 
 @torch.no_grad()
@@ -95,9 +94,9 @@ def leave_one_out(
     check_dtype(gaussians, "backend 'reference'")
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
-    largest, squared = torch.zeros(2, len(gaussians), dtype=torch.float64, device=rows.device)
+    largest, squared, total = torch.zeros(3, len(gaussians), dtype=torch.float64, device=rows.device)
     if not len(rows):
-        return LeaveOneOut(largest, squared)
+        return LeaveOneOut(largest, squared, total)
     if background is None:
         background = splats.colors.new_zeros(camera.height, camera.width, 3)
     if pixel_weights is None:
@@ -116,8 +115,9 @@ def leave_one_out(
         change = rest * (alphas / (1 - alphas))[..., None] - light
         largest[rows] = torch.maximum(largest[rows], change.abs().amax((1, 2)).double())
         squared[rows] += change.double().square().sum(2) @ pixel_weights.reshape(-1)[here].double()
+        total[rows] += weights.double().sum(1)
         begin += len(chunk)
-    return LeaveOneOut(largest, squared)
+    return LeaveOneOut(largest, squared, total)
 
 
 def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:

@@ -55,7 +55,7 @@ def count_tiles_pixels(
     zero_slots(slots, pair_slots, k, end, COUNTERS)
 
 
-CHANGE_COUNT, GATHERED_COUNT = 2, 5
+CHANGE_COUNT, GATHERED_COUNT = 3, 5
 CHANGES, GATHERED = constant(CHANGE_COUNT), constant(GATHERED_COUNT)
 
 
@@ -80,9 +80,9 @@ def remove_from_tiles(
     width, height, tiles_x, alpha_max,
     BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, THREE_WAYS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the slots of all pairs of one tile: largest change, sum of squares.
+    """Write the slots of all pairs of one tile: largest change, sum of blend weights, sum of squares.
 
-    THREE_WAYS: sums of squares by three layers of ``pixel_weights``, and the sum of blend weights."""
+    THREE_WAYS: three sums of squares, by as many layers of ``pixel_weights``."""
     tl.static_assert(BLOCK == 1)
     length: tl.constexpr = GATHERED if THREE_WAYS else CHANGES
     tile = tl.load(order + tl.program_id(0))
@@ -117,11 +117,11 @@ def remove_from_tiles(
         squared = of_red * of_red + of_green * of_green + of_blue * of_blue
         o = slots + tl.load(pair_slots + k) * length
         tl.store(o, tl.max(largest))
-        tl.store(o + 1, tl.sum(counts * squared))
+        tl.store(o + 1, tl.sum(weight))
+        tl.store(o + 2, tl.sum(counts * squared))
         if THREE_WAYS:
-            tl.store(o + 2, tl.sum(second * squared))
-            tl.store(o + 3, tl.sum(third * squared))
-            tl.store(o + 4, tl.sum(weight))
+            tl.store(o + 3, tl.sum(second * squared))
+            tl.store(o + 4, tl.sum(third * squared))
 
 
 @torch.no_grad()

@@ -4,13 +4,15 @@ A forward pass waits for the device once, for the numbers of visible rows, pairs
 backward pass never waits.
 """
 
+from dataclasses import replace
+
 import torch
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sparsestreet.ops.raster import LeaveOneOutSums, RowChanges
+from sparsestreet.ops.raster import LeaveOneOutSums
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend
 from sparsestreet.ops.triton.blend import MAX_ROWS
@@ -89,14 +91,14 @@ def leave_one_out(
     view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
     ends = blend_view(screen, view, lasts=True).ends
-    largest, totals = _remove(screen, view, ends, len(gaussians), background, pixel_weights)
-    return LeaveOneOut(largest, totals[:, 1])
+    found = _remove(screen, view, ends, len(gaussians), background, pixel_weights)
+    return replace(found, squared_change=found.squared_change[:, 0])
 
 
 def _remove(
     screen: Screen, view: KernelView, ends: Ends, rows: int, background: Tensor | None, pixel_weights: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """Largest change of each row, and its sums of slots; three layers of weights: those of LeaveOneOutSums."""
+) -> LeaveOneOut:
+    """Squared changes in one way, or in three by as many layers of weights."""
     three, lists, passed = pixel_weights is not None and pixel_weights.dim() == 3, screen.lists, ends.transmittance
     pairs = lists.sizes.pairs  # the tables may have room for more
     changes = passed.new_empty(pairs, GATHERED_COUNT if three else CHANGE_COUNT)
@@ -108,12 +110,12 @@ def _remove(
         BEHIND=behind is not None, WEIGHTED=counts is not None, THREE_WAYS=three, options=ONE_WARP,
     )  # fmt: skip
     totals = torch.zeros(rows, changes.shape[1], dtype=torch.float64, device=changes.device)
-    _sum_slots(changes, lists, totals, 8 if three else 2, tl.float64)
+    _sum_slots(changes, lists, totals, 8 if three else 4, tl.float64)
     # A maximum is the same in any order.
     largest = torch.zeros_like(totals[:, 0])
     of_pairs = changes[lists.slots[:pairs], 0].double()
     largest.scatter_reduce_(0, lists.rows_of_pairs[:pairs].long(), of_pairs, "amax")
-    return largest, totals
+    return LeaveOneOut(largest, totals[:, 2:], totals[:, 1])
 
 
 class _Blend(torch.autograd.Function):
@@ -150,10 +152,7 @@ class _Blend(torch.autograd.Function):
         ends, plain = Ends(transmittance, ctx.lasts, ctx.parts), view.settings.plain_gradients
         if (changes := ctx.changes) is not None:
             # A loop of its own over the same lists: in the one below it would take the registers of gradients.
-            largest, of_rows = _remove(
-                screen, view, ends, len(fields[0]), changes.background, changes.pixel_weights
-            )  # fmt: skip
-            changes.found = RowChanges(of_rows[:, 4], largest, of_rows[:, 1:4])
+            changes.found = _remove(screen, view, ends, len(fields[0]), changes.background, changes.pixel_weights)
         absolute = ctx.needs_input_grad[5] and not plain
         gradients = differentiate_view(screen, view, ends, v_rgb, v_passed, v_depth_sum, absolute)
         sums = transmittance.new_empty(len(fields[0]), gradients.shape[1])

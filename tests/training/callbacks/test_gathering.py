@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 import torch
 from lightning import Callback, Trainer
 
-from sparsestreet.pruning import LeaveOneOutRule, RenderContext, rules, select
+from sparsestreet.pruning import Gathered, LeaveOneOutRule, RenderContext, rules
 from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.gaussians import RowPlan, Selection
 from sparsestreet.scene.graph import SceneGraph
@@ -35,10 +34,10 @@ class Both(LeaveOneOutRule):
 
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
         assert context.gathered is not None
-        alone = replace(context, gathered=None)
-        self.found.append((self.costs(scene, frames, alone), self.floors(scene, frames, alone)))
         rest = context.gathered.rest(frames, context.ranks)
-        self.found.append((self.costs(scene, rest, context), self.floors(scene, rest, context)))
+        for views, seen in ((frames, Gathered(scene, self.areas(scene))), (rest, context.gathered)):
+            costs = self.costs(scene, views, context, seen)
+            self.found.append((costs, seen.areas.floors()))
         self.rests.append(len(rest))
         return {}
 
@@ -110,8 +109,8 @@ def test_the_pass_renders_nothing(tmp_path, monkeypatch, caplog):
     def refuse(*arguments: object, **options: object) -> None:
         raise AssertionError("a pass rendered a view that a step has shown")
 
-    for module, name in ((rules, "render"), (rules, "leave_one_out"), (select, "contribution")):
-        monkeypatch.setattr(module, name, refuse)
+    for name in ("render", "leave_one_out"):
+        monkeypatch.setattr(rules, name, refuse)
     with caplog.at_level(logging.INFO):
         system = train(tmp_path, LeaveOneOutRule(allowed_db=0.3), learning_rates=RATES)
     assert 0 < len(system.scene.nodes["road"].rows) < 30

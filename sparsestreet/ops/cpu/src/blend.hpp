@@ -66,6 +66,19 @@ void write_tile(const TileColors<T>& c, const View& view, int64_t x0, int64_t y0
   }
 }
 
+// What write_tile wrote, without depths.
+template <class T>
+void read_tile(TileColors<T>& c, const View& view, int64_t x0, int64_t y0, const Layers& image) {
+  const T *rgb = static_cast<const T*>(image.rgb), *transmittance = static_cast<const T*>(image.transmittance);
+  for (int64_t y = y0; y < y0 + TILE && y < view.height; ++y) {
+    for (int64_t x = x0; x < x0 + TILE && x < view.width; ++x) {
+      const int64_t to = (y - y0) * TILE + x - x0, from = y * view.width + x;
+      c.red[to] = rgb[3 * from], c.green[to] = rgb[3 * from + 1], c.blue[to] = rgb[3 * from + 2];
+      c.transmittance[to] = transmittance[from];
+    }
+  }
+}
+
 template <class T, bool EXCLUSIVE, bool GATED>
 void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
   const Cuts<T> cuts(view);

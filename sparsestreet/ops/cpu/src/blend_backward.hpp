@@ -7,7 +7,7 @@
 #pragma once
 #include <omp.h>
 
-#include "changes.hpp"
+#include "pixel.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -24,10 +24,9 @@ struct Columns {
   Lanes<T> s{}, sa{}, sb{}, sa_dy{}, sb_dy{}, abs_x{}, abs_y{}, red{}, green{}, blue{}, depth{}, gate{};
 };
 
-// WAYS > 0: what the view would change by without the row is gathered as well, counted so many ways (changes.hpp).
-template <class T, bool GATED, int WAYS>
+template <class T, bool GATED>
 inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cuts<T>& cuts, TileCotangents<T>& t,
-                           int at, T pair, Columns<T>& sums, TileChanges<T>& tile, ChangeColumns<T>& changes) {
+                           int at, T pair, Columns<T>& sums) {
   const T along = p.l21 * dy, b = p.l22 * dy, base = p.log2_opacity - b * b;
   const Sample<T> q = sample(p, dx, along, base, cuts);
   const Lanes<T> drawn = load(t.last + at) >= pair ? q.alpha : Lanes<T>{};
@@ -54,13 +53,12 @@ inline void accumulate_row(const Splat<T>& p, const Lanes<T>& dx, T dy, const Cu
   sums.green += weight * green;
   sums.blue += weight * blue;
   sums.depth += weight * depth;
-  if (WAYS) accumulate_change<T, WAYS>(p, apart(weight), apart(alpha) * apart(inverse), tile, at, changes);
 }
 
 template <class T>
 inline void add_columns(const Columns<T>& c, const Lanes<T>& dx, Slot<T>& slot) {
   slot.s += total<T>(c.s), slot.sa += total<T>(c.sa), slot.sb += total<T>(c.sb);
-  slot.sa_dx += total<T>(apart(c.sa * dx));  // dx is the same in every row of a column
+  slot.sa_dx += total<T>(c.sa * dx);  // dx is the same in every row of a column
   slot.sa_dy += total<T>(c.sa_dy), slot.sb_dy += total<T>(c.sb_dy);
   slot.abs_x += total<T>(c.abs_x), slot.abs_y += total<T>(c.abs_y);
   slot.color[0] += total<T>(c.red), slot.color[1] += total<T>(c.green), slot.color[2] += total<T>(c.blue);
@@ -85,45 +83,38 @@ void load_tile(TileCotangents<T>& t, const View& view, int64_t x0, int64_t y0, c
   }
 }
 
-template <class T, bool GATED, int WAYS>
+template <class T, bool GATED>
 void blend_tile_backward(Workspace<T>& ws, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
-                         TileCotangents<T>& t, TileChanges<T>& changes) {
+                         TileCotangents<T>& t) {
   const int64_t begin = ws.tile_begin[tile], end = ws.tile_end[tile];
   for (int64_t k = ws.tile_begin[tile + 1] - 1; k >= end; --k) {
     ws.slots[ws.pairs[k].slot] = Slot<T>{};
     if (GATED) ws.gate_slots[ws.pairs[k].slot] = 0;
-    if (WAYS) ws.gathered_slots[ws.pairs[k].slot] = ChangeSlot<T>{};
   }
   for (int64_t k = end - 1; k >= begin; --k) {
     if (k - PREFETCH >= begin) {
       __builtin_prefetch(&ws.splats[ws.pairs[k - PREFETCH].row]);
       __builtin_prefetch(&ws.slots[ws.pairs[k - PREFETCH].slot], 1);
     }
-    const Splat<T> s = ws.splats[ws.pairs[k].row];  // a copy: no store to the tile can change it
+    const Splat<T>& s = ws.splats[ws.pairs[k].row];
     const TileSplat<T> here(s, x0, y0);
     Slot<T> slot{};
-    ChangeSlot<T> change{};
     T gate = 0;
     for (int x = 0; x < TILE; x += LANES<T>) {
       const Lanes<T> dx = load(here.dx + x);
       Columns<T> sums;
-      ChangeColumns<T> found;
       for (int y = here.first; y <= here.last; ++y)
-        accumulate_row<T, GATED, WAYS>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums,
-                                          changes, found);
+        accumulate_row<T, GATED>(s, dx, T(y0 + y) + T(0.5) - s.y, cuts, t, y * TILE + x, T(k - begin), sums);
       add_columns(sums, dx, slot);
       if (GATED) gate += total<T>(sums.gate);
-      if (WAYS) add_changes<T, WAYS>(found, change);
     }
     ws.slots[ws.pairs[k].slot] = slot;
     if (GATED) ws.gate_slots[ws.pairs[k].slot] = gate;
-    if (WAYS) ws.gathered_slots[ws.pairs[k].slot] = change;
   }
 }
 
-template <class T, bool GATED, bool CHANGES>
-void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmittance, const Layers& cotangents,
-                          const Gathered* gathered) {
+template <class T, bool GATED>
+void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmittance, const Layers& cotangents) {
   const Cuts<T> cuts(view);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
@@ -131,12 +122,7 @@ void blend_tiles_backward(Workspace<T>& ws, const View& view, const T* transmitt
     TileCotangents<T> t;
     load_tile(t, view, x0, y0, transmittance, cotangents);
     std::memcpy(t.last, &ws.last_pairs[tile * PIXELS], sizeof(t.last));
-    TileChanges<T> changes;
-    const int ways = CHANGES ? load_changes(changes, view, x0, y0, transmittance, *gathered) : 0;
-    if (ways > 1)
-      blend_tile_backward<T, GATED, CHANGES ? COUNTINGS : 0>(ws, cuts, tile, x0, y0, t, changes);
-    else
-      blend_tile_backward<T, GATED, CHANGES ? 1 : 0>(ws, cuts, tile, x0, y0, t, changes);
+    blend_tile_backward<T, GATED>(ws, cuts, tile, x0, y0, t);
   }
 }
 
@@ -152,19 +138,15 @@ void sum_gates(const Workspace<T>& ws, const View& view, int64_t rows, T* gates)
 
 template <class T>
 void blend_backward(Workspace<T>& ws, const View& view, const T* transmittance, const Layers& cotangents, int64_t rows,
-                    T* gates, const Gathered* gathered) {
+                    T* gates) {
   const double start = omp_get_wtime();
   ws.slots.reserve(ws.pair_count);
   if (gates) {
     ws.gate_slots.reserve(ws.pair_count);
-    blend_tiles_backward<T, true, false>(ws, view, transmittance, cotangents, nullptr);
+    blend_tiles_backward<T, true>(ws, view, transmittance, cotangents);
     sum_gates(ws, view, rows, gates);
-  } else if (gathered) {
-    ws.gathered_slots.reserve(ws.pair_count);
-    blend_tiles_backward<T, false, true>(ws, view, transmittance, cotangents, gathered);
-    sum_changes(ws, view, rows, *gathered);
   } else {
-    blend_tiles_backward<T, false, false>(ws, view, transmittance, cotangents, nullptr);
+    blend_tiles_backward<T, false>(ws, view, transmittance, cotangents);
   }
   ws.seconds[BLEND_BACKWARD] = omp_get_wtime() - start;
 }

@@ -55,24 +55,17 @@ struct Counters {
   int64_t *pixels, *dominant;
 };
 
-// Behind the splats [h,w,3], null: black; how much each pixel's squared change counts [h,w], null: 1.
+// In how many ways squared changes can be counted at once.
+constexpr int COUNTINGS = 3;
+
+// Behind the splats [h,w,3], null: black; how much each pixel's squared change counts [ways,h,w], null: 1.
 struct Backdrop {
   const void *rgb, *pixel_weights;
 };
 
-// How far a view moves when a row alone is removed.
+// How far a view moves when a row alone is removed: largest and squared changes [n] and [n,ways]; sums of blend weights.
 struct Changes {
-  double *largest, *squared;
-};
-
-// In how many ways squared changes are counted in one backward pass.
-constexpr int COUNTINGS = 3;
-
-// What backward gathers beside gradients: behind the splats [h,w,3], null: black; how much each pixel's squared change
-// counts [COUNTINGS,h,w]; of the rows, sums of blend weights [n], largest changes [n], squared changes [n,COUNTINGS].
-struct Gathered {
-  const void *background, *pixel_weights;
-  double *weight, *largest, *squared;
+  double *largest, *squared, *weight;
 };
 
 // A cube map behind an image, and the camera that sees it; pointers to float or double.

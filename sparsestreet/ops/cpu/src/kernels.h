@@ -18,12 +18,12 @@ struct RowKernels {
 
 struct PixelKernels {
   void (*blend)(void*, const View&, bool gated, const Layers&);
-  // `gates`: where the gradients of the gates of all `rows` go; `gathered`: what else is gathered; null: there are none.
-  // Not both.
+  // `gates`: where the gradients of the gates of all `rows` go; null: there are none.
   void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents, int64_t rows,
-                         void* gates, const Gathered* gathered);
+                         void* gates);
   void (*count)(void*, const View&, int64_t rows, const Counters&);
-  void (*remove)(void*, const View&, int64_t rows, const Backdrop&, const Changes&);
+  // `drawn`: what blending has given, whose lists are still there; null: the lists are new, and blended here.
+  void (*remove)(void*, const View&, int64_t rows, const Backdrop&, int64_t ways, const Layers* drawn, const Changes&);
 };
 
 struct SkyKernels {

@@ -8,28 +8,40 @@ namespace SPLAT_VARIANT {
 // What is seen behind a splat, total (over the background) minus all up to it, and how much each pixel counts.
 template <class T>
 struct TileBehind {
-  alignas(64) T color[3][PIXELS], pixel_weight[PIXELS];
+  alignas(64) T color[3][PIXELS], pixel_weights[COUNTINGS][PIXELS];
 };
 
+// Sums over the rows of a tile, per column.
 template <class T>
-inline void behind_everything(const TileColors<T>& total, const View& view, const Backdrop& sky_image, int64_t x0,
-                              int64_t y0, TileBehind<T>& behind) {
+struct ChangeColumns {
+  Lanes<T> largest{}, weight{}, squared[COUNTINGS]{};
+};
+
+// Answers up to which counting any pixel of the tile has a weight: few tiles show all that is told apart.
+template <class T, int WAYS>
+inline int behind_everything(const TileColors<T>& total, const View& view, const Backdrop& sky_image, int64_t x0,
+                             int64_t y0, TileBehind<T>& behind) {
   const T* blended[3] = {total.red, total.green, total.blue};
   const T *background = static_cast<const T*>(sky_image.rgb), *weights = static_cast<const T*>(sky_image.pixel_weights);
+  int ways = 1;
   for (int i = 0; i < PIXELS; ++i) {
     const int64_t x = x0 + i % TILE, y = y0 + i / TILE, pixel = y * view.width + x;
     const bool inside = x < view.width && y < view.height;
-    behind.pixel_weight[i] = weights && inside ? weights[pixel] : T(1);
+    for (int k = 0; k < WAYS; ++k) {
+      behind.pixel_weights[k][i] = weights && inside ? weights[k * view.width * view.height + pixel] : T(1);
+      if (k >= ways && inside && behind.pixel_weights[k][i] != 0) ways = k + 1;
+    }
     for (int channel = 0; channel < 3; ++channel) {
       const T back = background && inside ? background[3 * pixel + channel] : T(0);
       behind.color[channel][i] = blended[channel][i] + total.transmittance[i] * back;
     }
   }
+  return ways;
 }
 
-template <class T, bool EXCLUSIVE>
+template <class T, bool EXCLUSIVE, int WAYS>
 inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts, TileColors<T>& c,
-                       TileBehind<T>& behind, int row, Lanes<T>& largest, Lanes<T>& squared) {
+                       TileBehind<T>& behind, int row, ChangeColumns<T>& sums) {
   const T b = s.l22 * dy, along = s.l21 * dy, base = s.log2_opacity - b * b;
   for (int x = 0; x < TILE; x += LANES<T>) {
     const int at = row * TILE + x;
@@ -38,66 +50,96 @@ inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts
                                                     transmittance, c.product + at);
     const Lanes<T> weight = alpha * transmittance, through = alpha / (T(1) - alpha);
     store(c.transmittance + at, transmittance - weight);
-    Lanes<T> sum{};
+    Lanes<T> square{};
     for (int channel = 0; channel < 3; ++channel) {
       const Lanes<T> own = weight * s.color[channel], rest = load(behind.color[channel] + at) - own;
       store(behind.color[channel] + at, rest);
       const Lanes<T> change = rest * through - own;
-      largest = larger(largest, magnitude(change));
-      sum += change * change;
+      sums.largest = larger(sums.largest, magnitude(change));
+      square += change * change;
     }
-    squared += load(behind.pixel_weight + at) * sum;
+    for (int k = 0; k < WAYS; ++k) sums.squared[k] += load(behind.pixel_weights[k] + at) * square;
+    sums.weight += weight;
   }
 }
 
+template <class T, bool EXCLUSIVE, int WAYS>
+void remove_pairs(Workspace<T>& ws, const Cuts<T> cuts, int64_t tile, int64_t x0, int64_t y0, TileColors<T>& c,
+                  TileBehind<T>& behind) {
+  for (int64_t k = ws.tile_begin[tile]; k < ws.tile_end[tile]; ++k) {
+    if (k + PREFETCH < ws.tile_end[tile]) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
+    const Splat<T> s = ws.splats[ws.pairs[k].row];  // a copy: no store to the tile can change it
+    const TileSplat<T> here(s, x0, y0);
+    ChangeColumns<T> sums;
+    for (int y = here.first; y <= here.last; ++y)
+      remove_row<T, EXCLUSIVE, WAYS>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, behind, y, sums);
+    T largest = 0, each[LANES<T>];
+    store(each, sums.largest);
+    for (int i = 0; i < LANES<T>; ++i) largest = each[i] > largest ? each[i] : largest;
+    typename Workspace<T>::Change change{double(largest), double(total<T>(sums.weight)), {}};
+    for (int i = 0; i < WAYS; ++i) change.squared[i] = double(total<T>(sums.squared[i]));
+    ws.change_slots[ws.pairs[k].slot] = change;
+  }
+  for (int64_t k = ws.tile_end[tile]; k < ws.tile_begin[tile + 1]; ++k) ws.change_slots[ws.pairs[k].slot] = {};
+}
+
+// Blends a tile, or takes up what blending has given.
 template <class T, bool EXCLUSIVE>
-void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const Backdrop& sky_image) {
-  const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
-  TileColors<T> c;
-  TileBehind<T> behind;
+void draw_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, int64_t x0, int64_t y0,
+               const Layers* drawn, TileColors<T>& c) {
   std::memset(static_cast<void*>(&c), 0, sizeof(c));
+  if (drawn) return read_tile(c, view, x0, y0, *drawn);
   open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
   int64_t samples = 0;
   sort_tile(ws, tile);
-  blend_tile<T, EXCLUSIVE, false>(ws, cuts, tile, x0, y0, c, samples);
-  behind_everything(c, view, sky_image, x0, y0, behind);
+  ws.tile_end[tile] = blend_tile<T, EXCLUSIVE, false>(ws, cuts, tile, x0, y0, c, samples);
+}
+
+template <class T, bool EXCLUSIVE, int WAYS>
+void remove_tile(Workspace<T>& ws, const View& view, const Cuts<T>& cuts, int64_t tile, const Backdrop& sky_image,
+                 const Layers* drawn) {
+  const int64_t x0 = tile % ws.tiles_x * TILE, y0 = tile / ws.tiles_x * TILE;
+  TileColors<T> c;
+  TileBehind<T> behind;
+  draw_tile<T, EXCLUSIVE>(ws, view, cuts, tile, x0, y0, drawn, c);
+  const int ways = behind_everything<T, WAYS>(c, view, sky_image, x0, y0, behind);
   open_tile(c.transmittance, view, x0, y0), open_tile(c.product, view, x0, y0);
-  for (int64_t k = ws.tile_begin[tile]; k < ws.tile_begin[tile + 1]; ++k) {
-    const Splat<T>& s = ws.splats[ws.pairs[k].row];
-    const TileSplat<T> here(s, x0, y0);
-    Lanes<T> largest{}, squared{};
-    for (int y = here.first; y <= here.last; ++y)
-      remove_row<T, EXCLUSIVE>(s, here.dx, T(y0 + y) + T(0.5) - s.y, cuts, c, behind, y, largest, squared);
-    typename Workspace<T>::Change change{0, 0};
-    for (int i = 0; i < LANES<T>; ++i) {
-      change.largest = largest[i] > change.largest ? double(largest[i]) : change.largest;
-      change.squared += double(squared[i]);
+  if (ways == 1)
+    remove_pairs<T, EXCLUSIVE, 1>(ws, cuts, tile, x0, y0, c, behind);
+  else
+    remove_pairs<T, EXCLUSIVE, WAYS>(ws, cuts, tile, x0, y0, c, behind);
+}
+
+// Sums the slots of each row, in a fixed order; 0 where it was culled.
+template <class T, int WAYS>
+void sum_changes(const Workspace<T>& ws, const View& view, int64_t rows, const Changes& out) {
+#pragma omp parallel for num_threads(view.threads) schedule(static)
+  for (int64_t i = 0; i < rows; ++i) {
+    typename Workspace<T>::Change sum{};
+    for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
+      const auto& slot = ws.change_slots[ws.tiles[i].first_slot + k];
+      sum.largest = slot.largest > sum.largest ? slot.largest : sum.largest, sum.weight += slot.weight;
+      for (int way = 0; way < WAYS; ++way) sum.squared[way] += slot.squared[way];
     }
-    ws.change_slots[ws.pairs[k].slot] = change;
+    out.largest[i] = sum.largest, out.weight[i] = sum.weight;
+    for (int way = 0; way < WAYS; ++way) out.squared[WAYS * i + way] = sum.squared[way];
   }
 }
 
-template <class T>
-void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const Backdrop& sky_image, const Changes& out) {
+template <class T, int WAYS>
+void remove_rows(Workspace<T>& ws, const View& view, int64_t rows, const Backdrop& sky_image, const Layers* drawn,
+                 const Changes& out) {
   const double start = omp_get_wtime();
   const Cuts<T> cuts(view);
   ws.change_slots.reserve(ws.pair_count);
 #pragma omp parallel for num_threads(view.threads) schedule(dynamic, 1)
   for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
     if (view.exclusive_stop)
-      remove_tile<T, true>(ws, view, cuts, tile, sky_image);
+      remove_tile<T, true, WAYS>(ws, view, cuts, tile, sky_image, drawn);
     else
-      remove_tile<T, false>(ws, view, cuts, tile, sky_image);
+      remove_tile<T, false, WAYS>(ws, view, cuts, tile, sky_image, drawn);
   }
-#pragma omp parallel for num_threads(view.threads) schedule(static)
-  for (int64_t i = 0; i < rows; ++i) {
-    typename Workspace<T>::Change sum{0, 0};
-    for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
-      const auto& slot = ws.change_slots[ws.tiles[i].first_slot + k];
-      sum.largest = slot.largest > sum.largest ? slot.largest : sum.largest, sum.squared += slot.squared;
-    }
-    out.largest[i] = sum.largest, out.squared[i] = sum.squared;
-  }
+  sum_changes<T, WAYS>(ws, view, rows, out);
   ws.seconds[COUNT] = omp_get_wtime() - start;
 }
 

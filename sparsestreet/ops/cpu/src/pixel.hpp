@@ -62,6 +62,14 @@ inline Lanes<T> still_open(const Lanes<T>& alpha, const Cuts<T>& cuts, const Lan
 }
 
 template <class T>
+inline T total(const Lanes<T>& values) {
+  T each[LANES<T>], sum = 0;
+  store(each, values);
+  for (int i = 0; i < LANES<T>; ++i) sum += each[i];
+  return sum;
+}
+
+template <class T>
 inline bool tile_finished(const T* state, T least) {
   T most = 0;
   for (int i = 0; i < PIXELS; ++i) most = state[i] > most ? state[i] : most;

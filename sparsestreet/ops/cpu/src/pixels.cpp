@@ -14,16 +14,16 @@ Workspace<T>& as(void* workspace) { return *static_cast<Workspace<T>*>(workspace
 template <class T>
 PixelKernels kernels() {
   return {[](void* w, const View& v, bool gated, const Layers& image) { blend(as<T>(w), v, gated, image); },
-          [](void* w, const View& v, const void* transmittance, const Layers& cotangents, int64_t rows, void* gates,
-             const Gathered* gathered) {
-            blend_backward(as<T>(w), v, static_cast<const T*>(transmittance), cotangents, rows, static_cast<T*>(gates),
-                           gathered);
+          [](void* w, const View& v, const void* transmittance, const Layers& cotangents, int64_t rows, void* gates) {
+            blend_backward(as<T>(w), v, static_cast<const T*>(transmittance), cotangents, rows, static_cast<T*>(gates));
           },
           [](void* w, const View& v, int64_t rows, const Counters& out) {
             count_contributions(as<T>(w), v, rows, out);
           },
-          [](void* w, const View& v, int64_t rows, const Backdrop& sky_image, const Changes& out) {
-            remove_rows(as<T>(w), v, rows, sky_image, out);
+          [](void* w, const View& v, int64_t rows, const Backdrop& sky_image, int64_t ways, const Layers* drawn,
+             const Changes& out) {
+            ways == 1 ? remove_rows<T, 1>(as<T>(w), v, rows, sky_image, drawn, out)
+                      : remove_rows<T, COUNTINGS>(as<T>(w), v, rows, sky_image, drawn, out);
           }};
 }
 

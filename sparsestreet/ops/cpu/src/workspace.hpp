@@ -68,12 +68,6 @@ struct Slot {
 template <class V>
 constexpr int SLOT_COLUMNS = sizeof(Slot<V>) / sizeof(V);
 
-// What the view would change by in the pixels of one pair without its splat (changes.hpp).
-template <class T>
-struct ChangeSlot {
-  T weight, largest, squared[COUNTINGS];
-};
-
 template <class T>
 struct Workspace {
   Buffer<Splat<T>> splats;   // by input row; only visible rows are written
@@ -92,10 +86,9 @@ struct Workspace {
   };
   Buffer<Count> count_slots;
   struct Change {
-    double largest, squared;
+    double largest, weight, squared[COUNTINGS];
   };
   Buffer<Change> change_slots;
-  Buffer<ChangeSlot<T>> gathered_slots;  // of each pair, where backward gathers changes
   int64_t pair_count = 0, tiles_x = 0, tiles_y = 0;
   int64_t samples = 0;  // (splat, pixel) pairs that the forward loops evaluated
   double seconds[STAGES] = {};
@@ -103,7 +96,7 @@ struct Workspace {
   void poison() {
     splats.poison(), tiles.poison(), histogram.poison(), part_slots.poison(), tile_begin.poison(), tile_end.poison();
     pairs.poison(), other_pairs.poison(), last_pairs.poison(), slots.poison();
-    gate_slots.poison(), count_slots.poison(), change_slots.poison(), gathered_slots.poison();
+    gate_slots.poison(), count_slots.poison(), change_slots.poison();
   }
 };
 
