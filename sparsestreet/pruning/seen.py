@@ -123,10 +123,10 @@ def squared_errors(rgb: Float[Tensor, "h w 3"], frame: Frame) -> Float64[Tensor,
 class Gathered:
     """What training steps have found out for a pass of ``LeaveOneOutRule``: sums over the views that they showed.
 
-    A pixel is linear in the alpha of each of its splats, so the backward pass of an ordinary step comes by all changes
-    that the pass would render the view for. They are those of the scene as it was at that step. The regions are summed
-    apart, because what a change weighs, 1 / squared error, is known only when all views were seen: so errors and
-    changes are of the same images, and nothing has to be gathered before them.
+    An ordinary step has rendered its view anyway, and its backward pass says how far the view changes without each row
+    (``ops.LeaveOneOutSums``). That is of the scene as it was at that step. The regions are summed apart, because what a
+    change weighs, 1 / squared error, is known only when all views were seen: so errors and changes are of the same
+    images, and nothing has to be gathered before them.
     """
 
     def __init__(self, scene: SceneGraph, areas: InstanceAreas) -> None:

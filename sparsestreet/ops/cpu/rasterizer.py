@@ -19,7 +19,7 @@ from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 PAIR_LIMIT = 1 << 28
 """Most (splat, tile) pairs of one rendering. A pair takes 24 bytes forward and 48 more backward in float32, and
-40 where changes are gathered.
+20 where changes are gathered.
 
 In float64 it takes 32 and 96. Buffers that have just grown are a quarter larger: up to 24 GB in float32."""
 

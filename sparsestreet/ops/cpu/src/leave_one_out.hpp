@@ -1,5 +1,7 @@
 // How far a view moves when one row alone is taken away. A pixel is linear in the alpha of each of its splats, so the
-// change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha).
+// change is exactly -alpha dC/dalpha = -w c + (light behind) alpha / (1 - alpha). In a training step lists and image are
+// there already. The loop stands beside that of the gradients, whose bits must not depend on it; one loop for both was
+// slower.
 #pragma once
 #include "blend.hpp"
 
@@ -50,15 +52,16 @@ inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts
                                                     transmittance, c.product + at);
     const Lanes<T> weight = alpha * transmittance, through = alpha / (T(1) - alpha);
     store(c.transmittance + at, transmittance - weight);
-    Lanes<T> square{};
+    Lanes<T> square{}, largest{};  // of its own: a chain through all channels of all rows would wait for each link
     for (int channel = 0; channel < 3; ++channel) {
       const Lanes<T> own = weight * s.color[channel], rest = load(behind.color[channel] + at) - own;
       store(behind.color[channel] + at, rest);
       const Lanes<T> change = rest * through - own;
-      sums.largest = larger(sums.largest, magnitude(change));
+      largest = larger(largest, magnitude(change));
       square += change * change;
     }
     for (int k = 0; k < WAYS; ++k) sums.squared[k] += load(behind.pixel_weights[k] + at) * square;
+    sums.largest = larger(sums.largest, largest);
     sums.weight += weight;
   }
 }
@@ -66,8 +69,12 @@ inline void remove_row(const Splat<T>& s, const T* dx, T dy, const Cuts<T>& cuts
 template <class T, bool EXCLUSIVE, int WAYS>
 void remove_pairs(Workspace<T>& ws, const Cuts<T> cuts, int64_t tile, int64_t x0, int64_t y0, TileColors<T>& c,
                   TileBehind<T>& behind) {
-  for (int64_t k = ws.tile_begin[tile]; k < ws.tile_end[tile]; ++k) {
-    if (k + PREFETCH < ws.tile_end[tile]) __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
+  const int64_t end = ws.tile_end[tile];
+  for (int64_t k = ws.tile_begin[tile]; k < end; ++k) {
+    if (k + PREFETCH < end) {
+      __builtin_prefetch(&ws.splats[ws.pairs[k + PREFETCH].row]);
+      __builtin_prefetch(&ws.change_slots[ws.pairs[k + PREFETCH].slot], 1);
+    }
     const Splat<T> s = ws.splats[ws.pairs[k].row];  // a copy: no store to the tile can change it
     const TileSplat<T> here(s, x0, y0);
     ChangeColumns<T> sums;
@@ -76,11 +83,11 @@ void remove_pairs(Workspace<T>& ws, const Cuts<T> cuts, int64_t tile, int64_t x0
     T largest = 0, each[LANES<T>];
     store(each, sums.largest);
     for (int i = 0; i < LANES<T>; ++i) largest = each[i] > largest ? each[i] : largest;
-    typename Workspace<T>::Change change{double(largest), double(total<T>(sums.weight)), {}};
-    for (int i = 0; i < WAYS; ++i) change.squared[i] = double(total<T>(sums.squared[i]));
+    typename Workspace<T>::Change change{largest, total<T>(sums.weight), {}};
+    for (int i = 0; i < WAYS; ++i) change.squared[i] = total<T>(sums.squared[i]);
     ws.change_slots[ws.pairs[k].slot] = change;
   }
-  for (int64_t k = ws.tile_end[tile]; k < ws.tile_begin[tile + 1]; ++k) ws.change_slots[ws.pairs[k].slot] = {};
+  for (int64_t k = end; k < ws.tile_begin[tile + 1]; ++k) ws.change_slots[ws.pairs[k].slot] = {};
 }
 
 // Blends a tile, or takes up what blending has given.
@@ -115,14 +122,14 @@ template <class T, int WAYS>
 void sum_changes(const Workspace<T>& ws, const View& view, int64_t rows, const Changes& out) {
 #pragma omp parallel for num_threads(view.threads) schedule(static)
   for (int64_t i = 0; i < rows; ++i) {
-    typename Workspace<T>::Change sum{};
+    double largest = 0, weight = 0, squared[WAYS] = {};
     for (int32_t k = 0; k < ws.tiles[i].count; ++k) {
       const auto& slot = ws.change_slots[ws.tiles[i].first_slot + k];
-      sum.largest = slot.largest > sum.largest ? slot.largest : sum.largest, sum.weight += slot.weight;
-      for (int way = 0; way < WAYS; ++way) sum.squared[way] += slot.squared[way];
+      largest = slot.largest > largest ? slot.largest : largest, weight += slot.weight;
+      for (int way = 0; way < WAYS; ++way) squared[way] += slot.squared[way];
     }
-    out.largest[i] = sum.largest, out.weight[i] = sum.weight;
-    for (int way = 0; way < WAYS; ++way) out.squared[WAYS * i + way] = sum.squared[way];
+    out.largest[i] = largest, out.weight[i] = weight;
+    for (int way = 0; way < WAYS; ++way) out.squared[WAYS * i + way] = squared[way];
   }
 }
 
