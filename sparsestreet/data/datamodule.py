@@ -215,7 +215,7 @@ class StreetData(LightningDataModule):
         return self._training
 
     def last_draws(self, end: int) -> frozenset[int]:
-        """As ``ShuffledFrames`` has them; none before there is a loader."""
+        """Return those of the loader; none before there is one."""
         return frozenset() if self._training is None else self._training.last_draws(end)
 
     def val_dataloader(self) -> OrderedFrames | list:

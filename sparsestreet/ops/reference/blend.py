@@ -55,7 +55,7 @@ def rasterize(
 
 
 def _fill(changes: LeaveOneOutSums, gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> None:
-    """By passes of their own, where other backends gather as they go backward."""
+    """Ask passes of their own, where other backends go on with what they have drawn."""
     ways = [leave_one_out(gaussians, changes.background, each, camera, settings) for each in changes.pixel_weights]
     squared = torch.stack([one.squared_change for one in ways], dim=1)
     changes.found = replace(ways[0], squared_change=squared)
