@@ -336,5 +336,7 @@ class LeaveOneOut:
 
     max_abs_change: Float64[Tensor, " n"]
     """Largest absolute change of a channel of a pixel."""
-    squared_change: Float64[Tensor, " n"]
-    """Sum over pixels and channels of the squared change times the pixel's weight."""
+    squared_change: Float64[Tensor, "n ..."]
+    """Sum over pixels and channels of the squared change times the pixel's weight, in each way that pixels weigh."""
+    weight: Float64[Tensor, " n"]
+    """Sum over pixels of the blend weight, as ``Contribution`` has it."""

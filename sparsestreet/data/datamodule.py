@@ -102,6 +102,17 @@ class ShuffledFrames:
             return torch.randint(count, (count,), generator=generator)
         return torch.randperm(count, generator=generator)
 
+    def last_draws(self, end: int) -> frozenset[int]:
+        """Return this process's draws before ``end`` whose frames no process draws once more before that.
+
+        Every frame is among those of all processes once, unless it was never drawn."""
+        count, size, stop = len(self.frames), self._ranks.size, end * self._ranks.size
+        # Without replacement every frame is drawn in the last two epochs.
+        first = 0 if self._with_replacement else max(stop // count - 1, 0)
+        drawn = [place for epoch in range(first, -(-stop // count)) for place in self._order(epoch)]
+        last = {place: number for number, place in enumerate(drawn[: stop - first * count], first * count)}
+        return frozenset(number // size for number in last.values() if number % size == self._ranks.rank)
+
     def state_dict(self) -> dict[str, int]:
         return {"finished": self._drawn if self._finished is None else self._finished()}
 
@@ -203,6 +214,10 @@ class StreetData(LightningDataModule):
             device=self._device,
         )
         return self._training
+
+    def last_draws(self, end: int) -> frozenset[int]:
+        """Return those of the loader; none before there is one."""
+        return frozenset() if self._training is None else self._training.last_draws(end)
 
     def val_dataloader(self) -> OrderedFrames | list:
         """The held-out frames in the order of the log, or ``val_frames`` of them; no loader where none is held out. Of

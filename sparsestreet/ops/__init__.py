@@ -12,13 +12,14 @@
 
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.guards import Guards, guards
-from sparsestreet.ops.raster import PairLimitError
+from sparsestreet.ops.raster import LeaveOneOutSums, PairLimitError
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.splat import contribution, leave_one_out, splat
 
 __all__ = [
     "Guards",
+    "LeaveOneOutSums",
     "PairLimitError",
     "SplatSettings",
     "contribution",

@@ -1,4 +1,4 @@
-"""What a backend returns to the op, before the background is added, or raises."""
+"""What a backend returns to the op, before the background is added, what it gathers beside gradients, or raises."""
 
 from dataclasses import dataclass
 
@@ -6,6 +6,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from sparsestreet.demand import DemandError
+from sparsestreet.types import LeaveOneOut
 
 MIN_ALPHA = 1e-6
 """Depth is divided by alpha, or by this where a pixel is emptier."""
@@ -41,3 +42,23 @@ class Raster:
     """Sum over splats of weight times depth, meters."""
     radii: Float[Tensor, " n"]
     """Half the longer side of the opacity-aware box, pixels; 0 for a culled row."""
+
+
+COUNTINGS = 3
+"""In how many ways squared changes are counted in one backward pass."""
+
+
+@dataclass
+class LeaveOneOutSums:
+    """What the backward pass of a view finds out beside its gradients: how far the view changes without each row.
+
+    The same as ``leave_one_out`` says, but lists and image of the rendering are there already: that leaves one loop
+    over the pixels.
+    """
+
+    pixel_weights: Float[Tensor, "3 h w"]
+    """How much the squared change of each pixel counts, in three ways."""
+    background: Float[Tensor, "h w 3"] | None = None
+    """Light behind the splats; None: black."""
+    found: LeaveOneOut | None = None
+    """None until the backward pass has run."""

@@ -10,9 +10,9 @@ from torch import Tensor
 from sparsestreet.ops import reference
 from sparsestreet.ops.backend import disable_compile, resolve_backend
 from sparsestreet.ops.cpu import rasterizer as cpu
-from sparsestreet.ops.raster import MIN_ALPHA, Raster
+from sparsestreet.ops.raster import MIN_ALPHA, LeaveOneOutSums, Raster
 from sparsestreet.ops.settings import SplatSettings
-from sparsestreet.ops.validate import check_gates, check_pixel_weights, check_structure
+from sparsestreet.ops.validate import check_changes, check_gates, check_pixel_weights, check_structure
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
@@ -28,6 +28,7 @@ def splat(
     backend: str = "auto",
     screen_gradients: bool = True,
     gates: Float[Tensor, " n"] | None = None,
+    changes: LeaveOneOutSums | None = None,
 ) -> Rendering:
     """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
 
@@ -53,6 +54,8 @@ def splat(
             dL/dM = alpha T (<dL/dC, c - b>), T the light that reaches it and b what is seen behind it. The stop rule
             sees gated alphas: rows behind the splat that finishes a pixel get none from there. On a GPU the values of
             gates are not checked, as those of a background.
+        changes: is filled by the backward pass; images and gradients are the same bits without it. None: nothing is
+            gathered, at no cost. Not with gates, which hide rows.
 
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is not a rigid motion, or whose size or lens is
@@ -74,11 +77,13 @@ def splat(
     chosen = resolve_backend(backend, gaussians.means.device)
     if gates is not None:
         check_gates(gates, gaussians.means)
+    if changes is not None:
+        check_changes(changes.pixel_weights, changes.background, gates, camera, gaussians.means)
     with torch.autocast(gaussians.means.device.type, enabled=False):
         offsets = _screen_offsets(gaussians, screen_gradients, filled=chosen != "triton")
         if chosen == "triton":
-            return _module(chosen).render(gaussians, offsets, background, camera, settings, gates)
-        raster = _module(chosen).rasterize(gaussians, offsets, camera, settings, gates=gates)
+            return _module(chosen).render(gaussians, offsets, background, camera, settings, gates, changes)
+        raster = _module(chosen).rasterize(gaussians, offsets, camera, settings, gates=gates, changes=changes)
         return _compose(raster, offsets, background)
 
 

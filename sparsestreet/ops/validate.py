@@ -83,6 +83,20 @@ def check_pixel_weights(weights: Tensor, camera: Camera, means: Tensor) -> None:
     _raise_in_image("pixel_weights", weights, (weights >= 0) & (weights < math.inf), "must be finite and >= 0")
 
 
+def check_changes(
+    weights: Tensor, background: Tensor | None, gates: Tensor | None, camera: Camera, means: Tensor
+) -> None:
+    """Check the shapes of what backward gathers changes with, and that no gate hides a row; raise ValueError.
+
+    Values are not checked, which would wait for a GPU."""
+    if gates is not None:
+        raise ValueError("changes are of all rows, but gates hide some of them: leave out gates or changes")
+    shape = (camera.height, camera.width)
+    _check_like(means, "pixel_weights", weights, (3, *shape), "give three weights per pixel of the camera")
+    if background is not None:
+        _check_like(means, "background", background, (*shape, 3), "give one color per pixel of the camera")
+
+
 def check_gates(gates: Tensor, means: Tensor) -> None:
     """Check for one gate in [0, 1] per row, of the means' dtype and device; raise ValueError.
 

@@ -1,8 +1,8 @@
 """Scores Gaussians over all training views and selects which to keep.
 
 ``select`` has the interface of the rules, and drops rows by scores but respects the floors of a node and its
-instances. ``rules`` has the paper's rule and ours (leave one out). ``importance`` has the paper's score, the rules of
-other papers, and controls that look at no image.
+instances. ``seen`` adds up what views show of rows, also in training steps. ``rules`` has the paper's rule and ours
+(leave one out). ``importance`` has the paper's score, the rules of other papers, and controls that look at no image.
 """
 
 from sparsestreet.pruning.importance import (
@@ -13,9 +13,8 @@ from sparsestreet.pruning.importance import (
     RandomRule,
 )
 from sparsestreet.pruning.rules import ImportanceRule, LeaveOneOutRule
+from sparsestreet.pruning.seen import Floors, Gathered, InstanceAreas, regions
 from sparsestreet.pruning.select import (
-    Floors,
-    InstanceAreas,
     PruningRule,
     RenderContext,
     keep_by_cost,
@@ -25,6 +24,7 @@ from sparsestreet.pruning.select import (
 
 __all__ = [
     "Floors",
+    "Gathered",
     "Importance",
     "ImportanceRule",
     "InstanceAreas",
@@ -38,4 +38,5 @@ __all__ = [
     "keep_by_cost",
     "keep_by_importance",
     "keep_by_rank",
+    "regions",
 ]

@@ -112,7 +112,7 @@ class WeightRule(_NumberRule):
         sums, areas = Importance(self.gate, per_pixel=False), self.areas(scene)
         for view, spans in contributions(scene, frames, context):
             sums.add(view)
-            areas.add(view, spans)
+            areas.add(view.weight, spans)
         weights, floors = sums.scores(context.ranks), areas.floors(context.ranks)
         scores = {name: self.scores(name, scene.nodes[name].rows, weights[spans[name]]) for name in floors}
         return keep_counts(scores, self.keep, floors, context)

@@ -7,9 +7,11 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.ops import leave_one_out
 from sparsestreet.pruning.importance import Importance
+from sparsestreet.pruning.seen import Gathered, regions, squared_errors
 from sparsestreet.pruning.select import (
     Keep,
     PruningRule,
@@ -60,7 +62,7 @@ class ImportanceRule(PruningRule):
         importance, areas = Importance(self.gate), self.areas(scene)
         for view, spans in contributions(scene, frames, context):
             importance.add(view)
-            areas.add(view, spans)
+            areas.add(view.weight, spans)
         every, floors = importance.scores(context.ranks), areas.floors(context.ranks)
         scores = {name: every[spans[name]] for name in floors}
         if self.keep is not None:
@@ -113,38 +115,46 @@ class LeaveOneOutRule(PruningRule):
         if not self.noticeable >= 0:
             raise ValueError(f"noticeable must be >= 0 (images lie in [0, 1]), got {self.noticeable}")
 
+    @property
+    def gathers(self) -> bool:
+        """Whether training steps say all that is asked; none of them shows a view beside the path as it is recorded."""
+        return self.beside is None
+
     @torch.no_grad()
     def select(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Selection]:
-        costs, floors = self.costs(scene, frames, context), self.floors(scene, frames, context)
+        seen = context.gathered or Gathered(scene, self.areas(scene))
+        costs = self.costs(scene, seen.rest(as_frames(frames), context.ranks), context, seen)
+        floors = seen.areas.floors(context.ranks)
         if self.keep is not None:
             return keep_counts(costs, self.keep, floors, context)
         return keep_by_cost({name: costs[name] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
 
     @torch.no_grad()
     def costs(
-        self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
+        self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext, seen: Gathered | None = None
     ) -> dict[str, Float64[Tensor, " _"]]:
-        """Return name of a node -> the cost of each of its rows, relative to the present squared error."""
-        none = torch.zeros(3, dtype=torch.float64, device=scene.device)
-        ranks = context.ranks
-        errors = sum((_squared_errors(scene, frame, context) for frame in on_device(scene, frames, ranks)), none)
-        errors = ranks.sum(errors)
-        spans = scene.gaussians_at(frames[0], context.state).spans
-        rows = max(span.stop for span in spans.values())
-        largest, squared = torch.zeros(2, rows, dtype=torch.float64, device=errors.device)
+        """Return name of a node -> the cost of each of its rows, relative to the present squared error.
+
+        ``seen``: what training steps have gathered of other views than these; it gets the areas that these show.
+        """
+        ranks, seen = context.ranks, seen or Gathered(scene, self.areas(scene))
+        errors = sum((_errors(scene, frame, context) for frame in on_device(scene, frames, ranks)), seen.errors)
         # If no error is left, any change costs too much. A region that no frame marks has no pixel to weigh.
-        share = (1 / errors.clamp(min=MIN_ERROR)).float()
+        share = 1 / ranks.sum(errors.clone()).clamp(min=MIN_ERROR)
+        largest, squared = seen.largest.clone(), seen.squared @ share
         for frame in on_device(scene, frames, ranks):
-            for view, weights in self._seen(frame, share):
-                change = _without_each(scene, view, weights, context)
+            for view, weights in self._seen(frame, share.float()):
+                change, spans = _without_each(scene, view, weights, context)
+                if view is frame:
+                    seen.areas.add(change.weight, spans)
                 largest, squared = torch.maximum(largest, change.max_abs_change), squared + change.squared_change
         largest, squared = ranks.largest(largest), ranks.sum(squared)
         costs = torch.where(largest > self.noticeable, squared, 0.0)
-        return {name: costs[rows] for name, rows in spans.items()}
+        return dict(zip(scene.nodes, costs.split(list(scene.counts().values())), strict=True))
 
     def _seen(self, frame: Frame, share: Float[Tensor, "3"]) -> Iterator[tuple[View, Float[Tensor, "h w"]]]:
         """Yield the view and, if asked, the one beside it, with the weight of a squared change of each pixel."""
-        yield frame, torch.einsum("r,rhw->hw", share, _regions(frame))
+        yield frame, torch.einsum("r,rhw->hw", share, regions(frame))
         if self.beside is not None:
             side = 1 if sum(frame.indices) % 2 else -1
             right = frame.camera.camera_from_world[0, :3].double()
@@ -152,20 +162,12 @@ class LeaveOneOutRule(PruningRule):
             yield replace(frame, camera=camera), share[0].expand(frame.image.shape[:2])
 
 
-def _regions(frame: Frame) -> Float[Tensor, "3 h w"]:
-    """Return 1 where a pixel belongs to the whole image, to vehicles, to people; to none where it is of the recording
-    car, which training does not show to the scene."""
-    everywhere = torch.ones(frame.image.shape[:2], dtype=torch.bool, device=frame.image.device)
-    everywhere = everywhere if frame.ego is None else ~frame.ego
-    nowhere = torch.zeros_like(everywhere)
-    marked = [nowhere if mask is None else mask & everywhere for mask in (frame.vehicle, frame.human)]
-    return torch.stack([everywhere, *marked]).float()
+def _without_each(
+    scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], context: RenderContext
+) -> tuple[LeaveOneOut, dict[str, slice]]:
+    """Return the change without each row, after the effects, with weights of squared changes of the pixels.
 
-
-def _without_each(scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], context: RenderContext) -> LeaveOneOut:
-    """Return the change without each row, after the effects, with the weights of squared changes of the pixels.
-
-    The largest change is multiplied by the largest slope of any pixel, an upper bound of the visible change.
+    Also name of a node -> its rows.
     """
     placed = scene.gaussians_at(view, context.state)
     effects = linearized(scene.effects.values(), placed.view)
@@ -173,17 +175,12 @@ def _without_each(scene: SceneGraph, view: View, weights: Float[Tensor, "h w"], 
         placed.gaussians,
         placed.view.camera,
         background=effects.background,
-        pixel_weights=weights if effects.slope is None else weights * effects.slope.square(),
+        pixel_weights=effects.weights(weights),
         settings=context.options.settings,
         backend=context.options.backend,
     )
-    if effects.slope is None:
-        return change
-    return replace(change, max_abs_change=effects.slope.max() * change.max_abs_change)
+    return replace(change, max_abs_change=effects.most(change.max_abs_change)), placed.spans
 
 
-def _squared_errors(scene: SceneGraph, frame: Frame, context: RenderContext) -> Float64[Tensor, "3"]:
-    """Return the squared error of one frame, summed over pixels and channels, for each of its regions."""
-    image = render(scene, frame, context.state, context.options).rgb
-    squared = (image.clamp(0, 1) - frame.image.to(image) / 255).double().square().sum(-1)
-    return (_regions(frame).double() * squared).sum((1, 2))
+def _errors(scene: SceneGraph, frame: Frame, context: RenderContext) -> Float64[Tensor, "3"]:
+    return squared_errors(render(scene, frame, context.state, context.options).rgb, frame)

@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -11,78 +10,14 @@ from torch import Tensor
 
 from sparsestreet.data.frame_cache import to_device
 from sparsestreet.ops import contribution
+from sparsestreet.pruning.seen import Floors, Gathered, InstanceAreas
 from sparsestreet.ranks import ALONE, Ranks
-from sparsestreet.scene.gaussians import InstanceFloors, Selection, keep_best
+from sparsestreet.scene.gaussians import Selection, keep_best
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.nodes import Node, NodeSettings
+from sparsestreet.scene.nodes import NodeSettings
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.scene.state import FINISHED, SceneState
 from sparsestreet.types import Contribution, Frame
-
-
-class Floors(NamedTuple):
-    """The least numbers of rows of a node and its instances, as ``keep_best`` takes them.
-
-    >>> Floors(min_gaussians=100)
-    Floors(min_gaussians=100, instances=None)
-    """
-
-    min_gaussians: int
-    instances: InstanceFloors | None = None
-
-
-class InstanceAreas:
-    """Accumulates, view by view, the largest area that each instance of some nodes fills, and returns their floors.
-
-    The area is the sum of the blend weights of the instance's rows over the pixels: the visible area in pixels. An
-    object that is hidden, far or transparent in all views fills little and keeps little. One that fills anything keeps
-    at least one row.
-    """
-
-    def __init__(self, nodes: Mapping[str, Node]) -> None:
-        self._nodes = dict(nodes)
-        objects = {name: node.instances() for name, node in nodes.items() if node.settings.min_instance_gaussians > 0}
-        self._instances = {name: instances for name, instances in objects.items() if instances is not None}
-        self._pixels: dict[str, Tensor] = {
-            name: torch.zeros(len(each.names), dtype=torch.float64, device=each.ids.device)
-            for name, each in self._instances.items()
-        }
-
-    @property
-    def needed(self) -> bool:
-        """Whether any instance has a floor of its own."""
-        return bool(self._instances)
-
-    def add(self, view: Contribution, spans: Mapping[str, slice]) -> None:
-        """Add one view of the whole scene; ``spans``: name of a node -> its rows."""
-        for name, instances in self._instances.items():
-            largest = self._pixels[name]
-            filled = torch.zeros_like(largest).index_add(0, instances.ids, view.weight[spans[name]].to(largest))
-            self._pixels[name] = torch.maximum(largest, filled)
-
-    def floors(self, ranks: Ranks = ALONE) -> dict[str, Floors]:
-        """Return name of every node -> its floors, from the views of all ``ranks``.
-
-        Raises ValueError for an area that is not finite.
-        """
-        self._pixels = {name: ranks.largest(pixels) for name, pixels in self._pixels.items()}
-        return {
-            name: Floors(node.settings.min_gaussians, self._of_instances(name)) for name, node in self._nodes.items()
-        }
-
-    def _of_instances(self, name: str) -> InstanceFloors | None:
-        instances = self._instances.get(name)
-        if instances is None:
-            return None
-        pixels = self._pixels[name]
-        if not pixels.isfinite().all():
-            index = int((~pixels.isfinite()).nonzero()[0])
-            raise ValueError(
-                f"an instance fills a finite number of pixels, but {instances.names[index]!r} of node {name!r} fills "
-                f"{float(pixels[index])}: look for NaN in its Gaussians before pruning"
-            )
-        least = (self._nodes[name].settings.min_instance_gaussians * pixels / 1000).ceil().long()
-        return InstanceFloors(instances.ids, torch.minimum(least, instances.counts()))
 
 
 @dataclass(frozen=True)
@@ -97,6 +32,8 @@ class RenderContext:
     """Number of passes before this one."""
     ranks: Ranks = ALONE
     """The processes that score together: each looks at its share of the views."""
+    gathered: Gathered | None = None
+    """What training steps have found out for a rule that ``gathers``; it looks at the other views alone."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +50,11 @@ class PruningRule(ABC):
         Computes no gradients. ``frames`` are all training views; each is read when it is indexed.
         """
 
+    @property
+    def gathers(self) -> bool:
+        """Whether training steps can find out what the rule asks of the views that they show."""
+        return False
+
     def touches(self, name: str, settings: NodeSettings) -> bool:
         """Whether the rule may remove rows from a node."""
         return settings.prunable and (self.nodes is None or name in self.nodes)
@@ -124,12 +66,12 @@ class PruningRule(ABC):
     def floors(self, scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Floors]:
         """Return name of every node that the rule touches -> its floors; render only if instances have floors.
 
-        A rule that needs ``contributions`` anyway adds them to its own ``areas`` instead.
+        A rule that needs the blend weights of rows anyway adds them to its own ``areas`` instead.
         """
         areas = self.areas(scene)
         if areas.needed:
             for view, spans in contributions(scene, frames, context):
-                areas.add(view, spans)
+                areas.add(view.weight, spans)
         return areas.floors(context.ranks)
 
 

@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from sparsestreet.geometry.cameras import project
-from sparsestreet.ops import splat
+from sparsestreet.ops import LeaveOneOutSums, splat
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.phases import phase
-from sparsestreet.scene.effects.effect import Exposed
+from sparsestreet.scene.effects.effect import Exposed, LinearizedEffects, linearized
 from sparsestreet.scene.graph import SceneGaussians, SceneGraph
 from sparsestreet.scene.state import DEFAULT_OPTIONS, FINISHED, RenderOptions, SceneState
 from sparsestreet.types import Gaussians, Rendering, View
@@ -110,6 +110,8 @@ class SceneRendering:
     """How it was rendered."""
     gates: Float[Tensor, " n"] | None = None
     """Which of its Gaussians masks sampled for a training step; None: all."""
+    changes: tuple[LeaveOneOutSums, LinearizedEffects] | None = None
+    """What the backward pass finds out about leaving each row out, and how that shows in ``rgb``; None: nothing."""
 
     @property
     def drawn(self) -> dict[str, Bool[Tensor, " _"]]:
@@ -119,16 +121,25 @@ class SceneRendering:
 
 
 def render(
-    scene: SceneGraph, view: View, state: SceneState = FINISHED, options: RenderOptions = DEFAULT_OPTIONS
+    scene: SceneGraph,
+    view: View,
+    state: SceneState = FINISHED,
+    options: RenderOptions = DEFAULT_OPTIONS,
+    pixel_weights: Float[Tensor, "3 h w"] | None = None,
 ) -> SceneRendering:
-    """Render the scene as a view sees it, in full precision also under autocast."""
+    """Render the scene as a view sees it, in full precision also under autocast.
+
+    ``pixel_weights``: how much a squared change of each pixel counts, in three ways; ``SceneRendering.changes`` then
+    gathers how far the image changes without each row. None: it does not, as where masks hide rows of the step, or
+    where light of several moments comes together.
+    """
     with torch.autocast(scene.device.type, enabled=False):
         with phase("scene"):
             placed = scene.gaussians_at(view, state)
         exposed = scene.exposed(placed.view)
         if exposed is not None:
             return _gathered(scene, placed, exposed, state, options)
-        return _drawn(scene, placed, state, options)
+        return _drawn(scene, placed, state, options, pixel_weights)
 
 
 def from_another_camera(
@@ -191,8 +202,15 @@ def _mean(images: Sequence[Tensor], weights: Sequence[float]) -> Tensor:
     return torch.stack([weight * image for weight, image in zip(weights, images, strict=True)]).sum(0)
 
 
-def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options: RenderOptions) -> SceneRendering:
+def _drawn(
+    scene: SceneGraph,
+    placed: SceneGaussians,
+    state: SceneState,
+    options: RenderOptions,
+    pixel_weights: Float[Tensor, "3 h w"] | None = None,
+) -> SceneRendering:
     gaussians = placed.gaussians
+    changes = None if pixel_weights is None or placed.gates is not None else _asked(scene, placed.view, pixel_weights)
     for effect in scene.effects.values():
         gaussians = effect.gaussians(gaussians, placed.view)
     with phase("splat"):
@@ -203,6 +221,7 @@ def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options
             backend=options.backend,
             screen_gradients=state.screen_gradients,
             gates=placed.gates,
+            changes=None if changes is None else changes[0],
         )
     rgb = splats.rgb
     for name, effect in scene.effects.items():
@@ -220,4 +239,13 @@ def _drawn(scene: SceneGraph, placed: SceneGaussians, state: SceneState, options
         state,
         options,
         placed.gates,
+        changes,
     )
+
+
+@torch.no_grad()
+def _asked(
+    scene: SceneGraph, view: View, pixel_weights: Float[Tensor, "3 h w"]
+) -> tuple[LeaveOneOutSums, LinearizedEffects]:
+    effects = linearized(scene.effects.values(), view)
+    return LeaveOneOutSums(effects.weights(pixel_weights), effects.background), effects

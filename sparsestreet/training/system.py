@@ -80,6 +80,8 @@ class StreetSystem(LightningModule):
         self.rendering: SceneRendering | None = None
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
+        self.pixel_weights: Float[Tensor, "3 h w"] | None = None
+        """Pruning says for each image whether its step finds out what ``render`` does with them."""
         self.quarantine = Quarantine()
         self.held_back: dict[str, int] = {}
         """Node -> Gaussians that were not added because memory had no room, over all refinements."""
@@ -120,7 +122,7 @@ class StreetSystem(LightningModule):
         frame = self.resolution.of(frame, self.global_step, self.course)
         # Losses divide small numbers: they stay in float32 whatever the trainer's precision.
         with torch.autocast(self.device.type, enabled=False):
-            self.rendering = render(self.scene, frame, state, self.options)
+            self.rendering = render(self.scene, frame, state, self.options, self.pixel_weights)
             # The splat op has waited for the device, so all that earlier steps said is on the host.
             self.said.pass_on(self.trainer)
             applicable = {name: loss for name, loss in self.losses.items() if loss.applies(frame)}

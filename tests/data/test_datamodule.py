@@ -48,6 +48,21 @@ def test_processes_take_turns_in_the_order_of_one(size, accumulated):
     assert turns == images[: len(turns)]
 
 
+@pytest.mark.parametrize("with_replacement", [False, True])
+@pytest.mark.parametrize(("size", "accumulated"), [(1, 1), (3, 1), (2, 2)])
+def test_last_draws_are_those_after_which_no_process_draws_the_frame_again(size, accumulated, with_replacement):
+    frames = as_frames([frame_at(index) for index in range(7)])
+    options = {"accumulated": accumulated, "with_replacement": with_replacement}
+    several = [ShuffledFrames(frames, 3, ranks=Ranks(rank, size), **options) for rank in range(size)]
+    parts = [[frame.frame_index for _ in range(3) for frame in loader] for loader in several]
+    turns = [frame for turn in zip(*parts, strict=True) for frame in turn]
+    for end in (1, 5, 7, 11, 20):
+        seen = turns[: end * size]
+        expected = [number for number, frame in enumerate(seen) if frame not in seen[number + 1 :]]
+        for rank, loader in enumerate(several):
+            assert loader.last_draws(end) == {number // size for number in expected if number % size == rank}
+
+
 def test_a_process_goes_on_at_its_own_place():
     frames = as_frames([frame_at(index) for index in range(7)])
     whole = list(ShuffledFrames(frames, 3, ranks=Ranks(1, 2)))

@@ -10,7 +10,7 @@ from sparsestreet.scene.gaussians import Rows
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Rigid
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.types import Camera, Contribution, Frame
+from sparsestreet.types import Camera, Frame
 from tests.scene.street import background, random_rows, rigid
 
 CONTEXT = RenderContext(options=RenderOptions(backend="reference"))
@@ -64,7 +64,7 @@ def test_the_area_is_the_most_pixels_that_an_instance_fills():
     spans = {"road": slice(0, 1), "cars": slice(1, 7)}
     for weights in ([9.0, 10.0, 5.0, 0.0, 1.5, 0.0, 0.0], [9.0, 1.0, 4.0, 2.0, 20.0, 0.0, 0.0]):
         weight = torch.tensor(weights, dtype=torch.float64)
-        areas.add(Contribution(weight, torch.ones(7, dtype=torch.long), torch.ones(7, dtype=torch.long)), spans)
+        areas.add(weight, spans)
     floors = areas.floors()["cars"].instances
     # 15 and 5 pixels, 1.5 and 22, none; 60 Gaussians per 1,000.
     assert floors.least.tolist() == [1, 2, 0]
@@ -73,8 +73,7 @@ def test_the_area_is_the_most_pixels_that_an_instance_fills():
 def test_no_more_than_an_instance_has():
     areas = InstanceAreas({"cars": objects(2, density=1e9)})
     weight = torch.tensor([1.0, 1.0, 1e-9, 0.0, 0.0, 0.0], dtype=torch.float64)
-    ones = torch.ones(6, dtype=torch.long)
-    areas.add(Contribution(weight, ones, ones), {"cars": slice(0, 6)})
+    areas.add(weight, {"cars": slice(0, 6)})
     assert areas.floors()["cars"].instances.least.tolist() == [2, 1, 0]
 
 
@@ -129,9 +128,8 @@ def test_a_node_whose_objects_have_no_rows(rule):
 def test_poisoned_contributions_are_refused():
     areas = InstanceAreas({"cars": objects(2)})
     weight = torch.tensor([1.0, 1.0, float("nan"), 0.0, 0.0, 0.0], dtype=torch.float64)
-    ones = torch.ones(6, dtype=torch.long)
-    areas.add(Contribution(weight, ones, ones), {"cars": slice(0, 6)})
-    areas.add(Contribution(torch.ones_like(weight), ones, ones), {"cars": slice(0, 6)})
+    areas.add(weight, {"cars": slice(0, 6)})
+    areas.add(torch.ones_like(weight), {"cars": slice(0, 6)})
     with pytest.raises(ValueError, match="'far' of node 'cars' fills nan"):
         areas.floors()
     with pytest.raises(ValueError, match=r"min_instance_gaussians must be >= 0 .*, got -1"):

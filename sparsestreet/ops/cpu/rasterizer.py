@@ -11,14 +11,15 @@ from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.lenses import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
-from sparsestreet.ops.raster import PairLimitError, Raster
+from sparsestreet.ops.raster import COUNTINGS, LeaveOneOutSums, PairLimitError, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype, check_values
 from sparsestreet.phases import phase
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
 
 PAIR_LIMIT = 1 << 28
-"""Most (splat, tile) pairs of one rendering. A pair takes 26 to 28 bytes forward and 48 more backward in float32.
+"""Most (splat, tile) pairs of one rendering. A pair takes 26 to 28 bytes forward and 48 more backward in float32, and
+20 where changes are gathered.
 
 In float64 it takes 34 to 36 and 96. Buffers that have just grown are a quarter larger: up to 24 GB in float32."""
 
@@ -32,6 +33,7 @@ def rasterize(
     every_tile: bool = False,
     *,
     gates: Float[Tensor, " n"] | None = None,
+    changes: LeaveOneOutSums | None = None,
 ) -> Raster:
     """Project, sort by tile and blend; float32 or float64. Bitwise the same for any number of threads.
 
@@ -43,7 +45,7 @@ def rasterize(
     g = gaussians
     fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
     view = _view(camera, settings, every_tile)
-    return Raster(*_Blend.apply(*fields, screen_offsets, gates, _moved(g), view, variant))
+    return Raster(*_Blend.apply(*fields, screen_offsets, gates, _moved(g), view, variant, changes))
 
 
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
@@ -62,11 +64,11 @@ def leave_one_out(
     settings: SplatSettings,
 ) -> LeaveOneOut:
     """How much the view changes when each row alone is removed."""
-    largest, squared = torch.empty(2, len(gaussians), dtype=torch.float64)
+    largest, squared, weight = torch.empty(3, len(gaussians), dtype=torch.float64)
     behind, counts = (None if layer is None else layer.detach().contiguous() for layer in (background, pixel_weights))
-    backdrop, changes = native.pointers(behind, counts), native.pointers(largest, squared)
+    backdrop, changes = native.pointers(behind, counts), native.pointers(largest, squared, weight)
     _measure("splat_leave_one_out", gaussians, camera, settings, backdrop, changes)
-    return LeaveOneOut(largest, squared)
+    return LeaveOneOut(largest, squared, weight)
 
 
 def _measure(
@@ -92,7 +94,9 @@ class _Blend(torch.autograd.Function):
     """Maps five fields, the screen offsets and the gates to the layers of a Raster."""
 
     @staticmethod
-    def forward(ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, displacements, view, variant):
+    def forward(
+        ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, displacements, view, variant, changes
+    ):  # fmt: skip
         ctx.set_materialize_grads(False)
         fields = tuple(field.contiguous() for field in (means, quaternions, scales, opacities, sh))
         gates = None if gates is None else gates.contiguous()
@@ -110,14 +114,14 @@ class _Blend(torch.autograd.Function):
         )
         _raise_for(status, fields, displacements, report)
         ctx.mark_non_differentiable(radii)
-        ctx.save_for_backward(*fields, gates, displacements, transmittance)
-        ctx.view, ctx.lease = view, lease
+        ctx.save_for_backward(*fields, gates, displacements, transmittance, None if changes is None else rgb)
+        ctx.view, ctx.lease, ctx.changes = view, lease, changes
         return rgb, transmittance, depth_sum, radii
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
-        *fields, gates, displacements, transmittance = ctx.saved_tensors
+        *fields, gates, displacements, transmittance, rgb = ctx.saved_tensors
         cotangents = [None if v is None else v.contiguous() for v in (v_rgb, v_transmittance, v_depth_sum)]
         gradients = [torch.empty_like(field) for field in fields]
         screen = fields[0].new_empty(fields[0].shape[0], 2)
@@ -132,7 +136,30 @@ class _Blend(torch.autograd.Function):
                 byref(native.pointers(*gradients, screen, of_gates)),
             )
         _raise_for(status, fields, displacements, native.CReport())
-        return *gradients, screen, of_gates, None, None, None
+        if ctx.changes is not None:
+            ctx.changes.found = _gathered(ctx.lease, ctx.view, ctx.changes, len(screen), rgb, transmittance)
+        return *gradients, screen, of_gates, None, None, None, None
+
+
+def _gathered(
+    lease: Lease, view: native.CView, changes: LeaveOneOutSums, rows: int, rgb: Tensor, transmittance: Tensor
+) -> LeaveOneOut:
+    """What the lists and the image of a rendering say of its rows: half of ``leave_one_out``, as both are there."""
+    largest, weight = torch.empty(2, rows, dtype=torch.float64)
+    squared = torch.empty(rows, COUNTINGS, dtype=torch.float64)
+    behind, weights = (None if one is None else one.contiguous() for one in (changes.background, changes.pixel_weights))
+    with phase("splat backward"):
+        status = native.load_library().splat_gather(
+            lease.workspace.handle,
+            byref(view),
+            rows,
+            byref(native.pointers(rgb, transmittance, None)),
+            byref(native.pointers(behind, weights)),
+            byref(native.pointers(largest, squared, weight)),
+        )
+    if status != native.STATUS_OK:
+        raise MemoryError("no memory for the changes of the splat op: render a smaller image or fewer rows")
+    return LeaveOneOut(largest, squared, weight)
 
 
 def _moved(gaussians: Gaussians) -> Tensor | None:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from sparsestreet.ops.raster import Raster
+from sparsestreet.ops.raster import LeaveOneOutSums, Raster
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype
@@ -23,6 +23,7 @@ def rasterize(
     settings: SplatSettings,
     *,
     gates: Float[Tensor, " n"] | None = None,
+    changes: LeaveOneOutSums | None = None,
 ) -> Raster:
     """Project all rows, sort them and blend them densely into every pixel; float32 or float64."""
     check_dtype(gaussians, "backend 'reference'")
@@ -44,11 +45,20 @@ def rasterize(
         for chunk in _pixel_chunks(camera, splats)
     ]
     rgb, transmittance, depth_sum = (torch.cat(part) for part in zip(*parts, strict=True))
+    if changes is not None:
+        rgb.register_hook(lambda _: _fill(changes, gaussians, camera, settings))
     radii = gaussians.means.detach().new_zeros(len(gaussians))
     if len(rows):
         radii[rows] = splats.half_boxes.amax(-1)
     shape = (camera.height, camera.width)
     return Raster(rgb.reshape(*shape, 3), transmittance.reshape(shape), depth_sum.reshape(shape), radii)
+
+
+def _fill(changes: LeaveOneOutSums, gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> None:
+    """Ask passes of their own, where other backends go on with what they have drawn."""
+    ways = [leave_one_out(gaussians, changes.background, each, camera, settings) for each in changes.pixel_weights]
+    squared = torch.stack([one.squared_change for one in ways], dim=1)
+    changes.found = replace(ways[0], squared_change=squared)
 
 
 @torch.no_grad()
@@ -84,9 +94,9 @@ def leave_one_out(
     check_dtype(gaussians, "backend 'reference'")
     rows = visible_rows(gaussians, camera, settings)
     splats = on_screen(gaussians, rows, camera, settings)
-    largest, squared = torch.zeros(2, len(gaussians), dtype=torch.float64, device=rows.device)
+    largest, squared, total = torch.zeros(3, len(gaussians), dtype=torch.float64, device=rows.device)
     if not len(rows):
-        return LeaveOneOut(largest, squared)
+        return LeaveOneOut(largest, squared, total)
     if background is None:
         background = splats.colors.new_zeros(camera.height, camera.width, 3)
     if pixel_weights is None:
@@ -105,8 +115,9 @@ def leave_one_out(
         change = rest * (alphas / (1 - alphas))[..., None] - light
         largest[rows] = torch.maximum(largest[rows], change.abs().amax((1, 2)).double())
         squared[rows] += change.double().square().sum(2) @ pixel_weights.reshape(-1)[here].double()
+        total[rows] += weights.double().sum(1)
         begin += len(chunk)
-    return LeaveOneOut(largest, squared)
+    return LeaveOneOut(largest, squared, total)
 
 
 def _pixel_chunks(camera: Camera, splats: Splats) -> tuple[Float[Tensor, "p 2"], ...]:

@@ -55,8 +55,8 @@ def count_tiles_pixels(
     zero_slots(slots, pair_slots, k, end, COUNTERS)
 
 
-CHANGE_COUNT = 2
-CHANGES = constant(CHANGE_COUNT)
+CHANGE_COUNT, GATHERED_COUNT = 3, 5
+CHANGES, GATHERED = constant(CHANGE_COUNT), constant(GATHERED_COUNT)
 
 
 @jit
@@ -78,10 +78,13 @@ def change_of(behind, own, through):
 def remove_from_tiles(
     records, pair_rows, pair_slots, begins, ends, lasts, order, transmittance, background, pixel_weights, slots,
     width, height, tiles_x, alpha_max,
-    BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, BLOCK: tl.constexpr,
+    BEHIND: tl.constexpr, WEIGHTED: tl.constexpr, THREE_WAYS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Write the slots of all pairs of one tile: largest change, sum of squares."""
+    """Write the slots of all pairs of one tile: largest change, sum of blend weights, sum of squares.
+
+    THREE_WAYS: three sums of squares, by as many layers of ``pixel_weights``."""
     tl.static_assert(BLOCK == 1)
+    length: tl.constexpr = GATHERED if THREE_WAYS else CHANGES
     tile = tl.load(order + tl.program_id(0))
     x, y, inside = pixels_of(tile, width, height, tiles_x)
     px, py = x.to(tl.float32) + 0.5, y.to(tl.float32) + 0.5
@@ -94,7 +97,11 @@ def remove_from_tiles(
     begin = tl.load(begins + tile)
     last = tl.load(lasts + at, inside, begin)
     latest = tl.max(last)
-    zero_slots(slots, pair_slots, latest, tl.load(ends + tile), CHANGES)
+    if THREE_WAYS:
+        layer = width * height
+        second = tl.load(pixel_weights + layer + at, inside, 0.0)
+        third = tl.load(pixel_weights + 2 * layer + at, inside, 0.0)
+    zero_slots(slots, pair_slots, latest, tl.load(ends + tile), length)
     for i in range(latest - begin):
         k = latest - 1 - i
         s = record.record_of(records, row_of(tl.load(pair_rows + k)))
@@ -107,9 +114,14 @@ def remove_from_tiles(
         of_green, green = change_of(green, weight * tl.load(s + record.COLOR + 1), through)
         of_blue, blue = change_of(blue, weight * tl.load(s + record.COLOR + 2), through)
         largest = tl.maximum(tl.maximum(tl.abs(of_red), tl.abs(of_green)), tl.abs(of_blue))
-        o = slots + tl.load(pair_slots + k) * CHANGES
+        squared = of_red * of_red + of_green * of_green + of_blue * of_blue
+        o = slots + tl.load(pair_slots + k) * length
         tl.store(o, tl.max(largest))
-        tl.store(o + 1, tl.sum(counts * (of_red * of_red + of_green * of_green + of_blue * of_blue)))
+        tl.store(o + 1, tl.sum(weight))
+        tl.store(o + 2, tl.sum(counts * squared))
+        if THREE_WAYS:
+            tl.store(o + 3, tl.sum(second * squared))
+            tl.store(o + 4, tl.sum(third * squared))
 
 
 @torch.no_grad()

@@ -4,16 +4,25 @@ A forward pass waits for the device once, for the numbers of visible rows, pairs
 backward pass never waits.
 """
 
+from dataclasses import replace
+
 import torch
 import triton.language as tl
 from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from sparsestreet.ops.raster import LeaveOneOutSums
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend
 from sparsestreet.ops.triton.blend import MAX_ROWS
-from sparsestreet.ops.triton.counters import CHANGE_COUNT, COUNTER_COUNT, count_tiles_pixels, remove_from_tiles
+from sparsestreet.ops.triton.counters import (
+    CHANGE_COUNT,
+    COUNTER_COUNT,
+    GATHERED_COUNT,
+    count_tiles_pixels,
+    remove_from_tiles,
+)
 from sparsestreet.ops.triton.gradients import GATE_PLACE, OPTIONS, ROWS, block_of, project_rows_backward, sum_slots
 from sparsestreet.ops.triton.launch import is_interpreted, launch
 from sparsestreet.ops.triton.lists import Lists
@@ -37,6 +46,7 @@ def render(
     camera: Camera,
     settings: SplatSettings,
     gates: Float[Tensor, " n"] | None = None,
+    changes: LeaveOneOutSums | None = None,
 ) -> Rendering:
     """Projects, sorts by tile, blends and composes, in float32. Bitwise the same in every run on one device."""
     g = gaussians
@@ -45,7 +55,7 @@ def render(
     learned = fields if gates is None else (*fields, gates)
     differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*learned, screen_offsets))
     view = KernelView.of(camera, settings)
-    images = _Blend.apply(*fields, screen_offsets, gates, background, g.displacements, view, differentiated)
+    images = _Blend.apply(*fields, screen_offsets, gates, background, g.displacements, view, differentiated, changes)
     return Rendering(*images, screen_offsets)
 
 
@@ -80,22 +90,32 @@ def leave_one_out(
     _check(gaussians)
     view = KernelView.of(camera, settings)
     screen = project(gaussians, view)
-    lists, layers = screen.lists, blend_view(screen, view, lasts=True)
-    changes = screen.records.new_empty(len(lists.slots), CHANGE_COUNT)
+    ends = blend_view(screen, view, lasts=True).ends
+    found = _remove(screen, view, ends, len(gaussians), background, pixel_weights)
+    return replace(found, squared_change=found.squared_change[:, 0])
+
+
+def _remove(
+    screen: Screen, view: KernelView, ends: Ends, rows: int, background: Tensor | None, pixel_weights: Tensor | None
+) -> LeaveOneOut:
+    """Squared changes in one way, or in three by as many layers of weights."""
+    three, lists, passed = pixel_weights is not None and pixel_weights.dim() == 3, screen.lists, ends.transmittance
+    pairs = lists.sizes.pairs  # the tables may have room for more
+    changes = passed.new_empty(pairs, GATHERED_COUNT if three else CHANGE_COUNT)
     behind, counts = contiguous(background), contiguous(pixel_weights)
-    passed = layers.ends.transmittance
     launch(
         remove_from_tiles, len(lists.order), 1,
-        screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, layers.ends.lasts, lists.order,
+        screen.records, lists.pair_rows, lists.slots, lists.begins, lists.ends, ends.lasts, lists.order,
         passed, given_or(behind, passed), given_or(counts, passed), changes, *pixel_arguments(view),
-        BEHIND=behind is not None, WEIGHTED=counts is not None, options=ONE_WARP,
+        BEHIND=behind is not None, WEIGHTED=counts is not None, THREE_WAYS=three, options=ONE_WARP,
     )  # fmt: skip
-    totals = torch.zeros(len(gaussians), CHANGE_COUNT, dtype=torch.float64, device=changes.device)
-    _sum_slots(changes, lists, totals, 2, tl.float64)
+    totals = torch.zeros(rows, changes.shape[1], dtype=torch.float64, device=changes.device)
+    _sum_slots(changes, lists, totals, 8 if three else 4, tl.float64)
     # A maximum is the same in any order.
     largest = torch.zeros_like(totals[:, 0])
-    largest.scatter_reduce_(0, lists.rows_of_pairs.long(), changes[lists.slots, 0].double(), "amax")
-    return LeaveOneOut(largest, totals[:, 1])
+    of_pairs = changes[lists.slots[:pairs], 0].double()
+    largest.scatter_reduce_(0, lists.rows_of_pairs[:pairs].long(), of_pairs, "amax")
+    return LeaveOneOut(largest, totals[:, 2:], totals[:, 1])
 
 
 class _Blend(torch.autograd.Function):
@@ -104,7 +124,7 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, background, displacements, view,
-        differentiated,
+        differentiated, changes,
     ):  # fmt: skip
         ctx.set_materialize_grads(False)
         gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
@@ -115,7 +135,7 @@ class _Blend(torch.autograd.Function):
         ctx.mark_non_differentiable(screen.radii)
         ctx.save_for_backward(*fields_of(gaussians), drawn.ends.transmittance, drawn.depth, background)
         ctx.screen, ctx.view, ctx.displacements = screen, view, contiguous(displacements)
-        ctx.lasts, ctx.parts = drawn.ends.lasts, drawn.ends.parts
+        ctx.lasts, ctx.parts, ctx.changes = drawn.ends.lasts, drawn.ends.parts, changes
         return drawn.rgb, drawn.alpha, drawn.depth, screen.radii
 
     @staticmethod
@@ -128,8 +148,11 @@ class _Blend(torch.autograd.Function):
             transmittance, depth, background, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[7]
         )
         if not any(ctx.needs_input_grad[:7]):
-            return *[None] * 7, v_background, None, None, None
+            return *[None] * 7, v_background, None, None, None, None
         ends, plain = Ends(transmittance, ctx.lasts, ctx.parts), view.settings.plain_gradients
+        if (changes := ctx.changes) is not None:
+            # A loop of its own over the same lists: in the one below it would take the registers of gradients.
+            changes.found = _remove(screen, view, ends, len(fields[0]), changes.background, changes.pixel_weights)
         absolute = ctx.needs_input_grad[5] and not plain
         gradients = differentiate_view(screen, view, ends, v_rgb, v_passed, v_depth_sum, absolute)
         sums = transmittance.new_empty(len(fields[0]), gradients.shape[1])
@@ -144,7 +167,7 @@ class _Blend(torch.autograd.Function):
             CLAMPED=view.settings.clamp_colors, DETACHED=view.settings.detach_directions, PLAIN=plain,
             **effects(view, ctx.displacements),
         )  # fmt: skip
-        return *outputs, v_screen, _of_gates(screen, sums), v_background, None, None, None
+        return *outputs, v_screen, _of_gates(screen, sums), v_background, None, None, None, None
 
 
 def _of_gates(screen: Screen, sums: Float[Tensor, "n s"]) -> Float[Tensor, " n"] | None:

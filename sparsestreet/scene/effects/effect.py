@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor, nn
 
 from sparsestreet.pictures.images import Panel
@@ -253,6 +253,14 @@ class LinearizedEffects:
     """None: 1."""
     background: Float[Tensor, "h w 3"] | None
     """None: black."""
+
+    def weights(self, of_image: Float[Tensor, "*w h w"]) -> Float[Tensor, "*w h w"]:
+        """What the squared change of a pixel of the splats weighs where that of the image has these weights."""
+        return of_image if self.slope is None else of_image * self.slope.square()
+
+    def most(self, of_splats: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+        """An upper bound of changes of the image: those of the splats times the largest slope of any pixel."""
+        return of_splats if self.slope is None else self.slope.max() * of_splats
 
 
 def neighbors_in_time(times: Sequence[float], time: float) -> tuple[int, int, float]:

@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from sparsestreet.evidence.light import sky_share
-from sparsestreet.geometry.cameras import ray_directions
 from sparsestreet.ops import over_sky
 from sparsestreet.ops.cube_map import colors_along
 from sparsestreet.pictures.images import Marked
@@ -102,4 +101,6 @@ class Sky(Effect):
         return over_sky(rgb, splats.alpha, self.texels, view.camera, transmittance_min=limit, backend=backend)
 
     def background(self, view: View) -> Float[Tensor, "h w 3"]:
-        return self.colors(ray_directions(view.camera, self.texels.device))
+        shape = (view.camera.height, view.camera.width)
+        rgb, alpha = self.texels.new_zeros(*shape, 3), self.texels.new_zeros(shape)
+        return over_sky(rgb, alpha, self.texels, view.camera, transmittance_min=0.0)

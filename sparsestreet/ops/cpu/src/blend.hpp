@@ -56,6 +56,16 @@ void write_tile(const TileColors<T>& c, const View& view, int64_t x0, int64_t y0
   });
 }
 
+// What write_tile wrote, without depths.
+template <class T>
+void read_tile(TileColors<T>& c, const View& view, int64_t x0, int64_t y0, const Layers& image) {
+  const T *rgb = static_cast<const T*>(image.rgb), *transmittance = static_cast<const T*>(image.transmittance);
+  for_each_pixel(view, x0, y0, [&](int to, int64_t from) {
+    c.red[to] = rgb[3 * from], c.green[to] = rgb[3 * from + 1], c.blue[to] = rgb[3 * from + 2];
+    c.transmittance[to] = transmittance[from];
+  });
+}
+
 template <class T, bool EXCLUSIVE, bool GATED>
 void blend_tiles(Workspace<T>& ws, const View& view, const Layers& image) {
   const Cuts<T> cuts(view);

@@ -50,13 +50,6 @@ inline void accumulate_register(const Splat<T>& p, const TilePixels<T>& pixels, 
   sums.depth += weight * depth;
 }
 
-template <class T>
-inline T total(const Lanes<T>& values) {
-  T sum = 0;
-  for (int i = 0; i < LANES<T>; ++i) sum += values[i];
-  return sum;
-}
-
 // Sums over the lanes.
 template <class T>
 inline void store_totals(const Slot<Lanes<T>>& sums, Slot<T>& slot) {

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 15;
+constexpr int32_t INTERFACE_VERSION = 16;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -55,14 +55,17 @@ struct Counters {
   int64_t *pixels, *dominant;
 };
 
-// Behind the splats [h,w,3], null: black; how much each pixel's squared change counts [h,w], null: 1.
+// In how many ways squared changes can be counted at once.
+constexpr int COUNTINGS = 3;
+
+// Behind the splats [h,w,3], null: black; how much each pixel's squared change counts [ways,h,w], null: 1.
 struct Backdrop {
   const void *rgb, *pixel_weights;
 };
 
-// How far a view moves when a row alone is removed.
+// How far a view moves when a row alone is removed: largest and squared changes [n] and [n,ways]; sums of blend weights.
 struct Changes {
-  double *largest, *squared;
+  double *largest, *squared, *weight;
 };
 
 // A cube map behind an image, and the camera that sees it; pointers to float or double.

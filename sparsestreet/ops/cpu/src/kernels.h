@@ -22,7 +22,8 @@ struct PixelKernels {
   void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents, int64_t rows,
                          void* gates);
   void (*count)(void*, const View&, int64_t rows, const Counters&);
-  void (*remove)(void*, const View&, int64_t rows, const Backdrop&, const Changes&);
+  // `drawn`: what blending has given, whose lists are still there; null: the lists are new, and blended here.
+  void (*remove)(void*, const View&, int64_t rows, const Backdrop&, int64_t ways, const Layers* drawn, const Changes&);
 };
 
 struct SkyKernels {

@@ -161,8 +161,16 @@ SPLAT_API int32_t splat_leave_one_out(Handle* h, const View* view, const Rows* r
                                 const Changes* changes, Report* report) {
   return guarded([&]() -> int32_t {
     const Status status = h->rows().prepare(h->workspace, *view, *rows, nullptr, *report);
-    if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, *sky_image, *changes);
+    if (status == OK) h->pixels().remove(h->workspace, *view, rows->count, *sky_image, 1, nullptr, *changes);
     return status;
+  });
+}
+
+// The same of the view that splat_forward has left in the workspace and in `image`, counted in COUNTINGS ways.
+SPLAT_API int32_t splat_gather(Handle* h, const View* view, int64_t rows, const Layers* image, const Backdrop* sky_image,
+                               const Changes* changes) {
+  return guarded([&]() -> int32_t {
+    return h->pixels().remove(h->workspace, *view, rows, *sky_image, COUNTINGS, image, *changes), OK;
   });
 }
 

@@ -44,6 +44,13 @@ inline Lanes<T> still_open(const Lanes<T>& alpha, const Cuts<T>& cuts, const Lan
   return passed > cuts.transmittance_min ? alpha : Lanes<T>{};
 }
 
+template <class T>
+inline T total(const Lanes<T>& values) {
+  T sum = 0;
+  for (int i = 0; i < LANES<T>; ++i) sum += values[i];
+  return sum;
+}
+
 // 1 inside the image, 0 outside: pixels outside are finished from the start.
 template <class T>
 inline void open_tile(T* state, const View& view, const TilePixels<T>& pixels) {

@@ -20,8 +20,10 @@ PixelKernels kernels() {
           [](void* w, const View& v, int64_t rows, const Counters& out) {
             count_contributions(as<T>(w), v, rows, out);
           },
-          [](void* w, const View& v, int64_t rows, const Backdrop& sky_image, const Changes& out) {
-            remove_rows(as<T>(w), v, rows, sky_image, out);
+          [](void* w, const View& v, int64_t rows, const Backdrop& sky_image, int64_t ways, const Layers* drawn,
+             const Changes& out) {
+            ways == 1 ? remove_rows<T, 1>(as<T>(w), v, rows, sky_image, drawn, out)
+                      : remove_rows<T, COUNTINGS>(as<T>(w), v, rows, sky_image, drawn, out);
           }};
 }
 

@@ -96,7 +96,7 @@ struct Workspace {
   };
   Buffer<Count> count_slots;
   struct Change {
-    double largest, squared;
+    T largest, weight, squared[COUNTINGS];
   };
   Buffer<Change> change_slots;
   int64_t pair_count = 0, tiles_x = 0, tiles_y = 0;
