@@ -155,7 +155,7 @@ def _plain(value: Any) -> Any:
 def _write(path: Path, value: object) -> None:
     arrays: dict[str, np.ndarray] = {}
     tree = json.dumps(_packed(value, arrays))
-    np.savez(path, **{_TREE: np.array(tree)}, **arrays)
+    np.savez(path, allow_pickle=False, **{_TREE: np.array(tree)}, **arrays)
 
 
 def _packed(value: Any, arrays: dict[str, np.ndarray]) -> Any:

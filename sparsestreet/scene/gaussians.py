@@ -1,7 +1,7 @@
 """The table of a node's Gaussians: which columns it has, its rows, and what happens to them when rows come and go."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -51,6 +51,15 @@ class RowPlan:
         """
         source = torch.nonzero(mask).squeeze(-1)
         return RowPlan(len(mask), source, torch.zeros_like(source, dtype=torch.bool))
+
+    def reordered(self, order: Int[Tensor, " new"]) -> "RowPlan":
+        """Return the plan whose new row i is this one's new row order[i].
+
+        >>> RowPlan.keep(torch.tensor([True, False, True])).reordered(torch.tensor([1, 0])).source.tolist()
+        [2, 0]
+        """
+        edits = {name: values[order] for name, values in self.edits.items()}
+        return replace(self, source=self.source[order], fresh=self.fresh[order], edits=edits)
 
 
 class Rows(nn.Module):

@@ -11,6 +11,7 @@ from lightning.fabric.utilities import move_data_to_device
 from torch import Tensor
 from torch.utils.hooks import RemovableHandle
 
+from sparsestreet.codec.vectors import curve_order
 from sparsestreet.phases import phase
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.curves import CountChange
@@ -221,7 +222,10 @@ class DensityControl(Callback, RowListener):
                 self.generator.set_state(drawn)
                 plan = strategy.densify(node.rows, statistics, max_gaussians=fits, generator=self.generator, **when)
             resize_rows(trainer, system, name, plan, "densify")
-        resize_rows(trainer, system, name, strategy.cull(node.rows, statistics, **when), "cull")
+        culled = strategy.cull(node.rows, statistics, **when)
+        if node.instances() is None:
+            culled = _along_curve(culled, node.rows.means)
+        resize_rows(trainer, system, name, culled, "cull")
         outside = node.outside()
         if outside is not None and bool(outside.any()):
             resize_rows(trainer, system, name, RowPlan.keep(~outside), "outside its box")
@@ -276,6 +280,16 @@ class DensityControl(Callback, RowListener):
         self.statistics = first
         self.generator.set_state(state_dict["generator"])
         self.last_reset = state_dict["last_reset"]
+
+
+def _along_curve(plan: RowPlan, means: Tensor) -> RowPlan:
+    """Return the plan with its rows along a curve that fills space: a tile's splats then lie near each other in memory.
+
+    A frame of 130,000 rows takes 24 % less time so, a step 5 % (docs/scaling.md).
+    """
+    kept = plan.edits.get("means", means.detach()[plan.source])
+    order = curve_order(kept.double().cpu().numpy())
+    return plan.reordered(torch.from_numpy(order).to(means.device))
 
 
 def _strategy(node: Node) -> DensityStrategy:

@@ -20,7 +20,7 @@ GAIN = torch.tensor([1.25, 1.0, 0.8])
 
 def gain(view: View) -> Tensor:
     """Another one for each image."""
-    return GAIN ** (1 + view.frame_index)
+    return GAIN ** (1 + view.indices[0])
 
 
 HIDDEN = [0.05, 0.0, 8.0]
