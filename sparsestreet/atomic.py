@@ -90,7 +90,13 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def writable(path: Path) -> Iterator[None]:
-    """Say of an OSError of the block that ``path`` cannot be written, and why."""
+    """Say of an OSError of the block that ``path`` cannot be written, and why.
+
+    >>> with writable(Path("there")):
+    ...     raise PermissionError(13, "Permission denied")
+    Traceback (most recent call last):
+    OSError: there cannot be written (Permission denied)...
+    """
     try:
         yield
     except OSError as error:
@@ -132,6 +138,13 @@ def acquire_lock(path: Path) -> int | None:
     """Take the lock of a file, which is made; answers at once with its descriptor, None where somebody else holds it.
 
     Raises OSError where the file cannot be made.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     held = acquire_lock(Path(folder) / "lock")
+    ...     acquire_lock(Path(folder) / "lock") is None
+    ...     release_lock(Path(folder) / "lock", held)
+    True
     """
     import fcntl  # Windows has none
 
@@ -148,7 +161,15 @@ def acquire_lock(path: Path) -> int | None:
 
 
 def release_lock(path: Path, descriptor: int) -> None:
-    """Remove the file and give its lock up."""
+    """Remove the file and give its lock up.
+
+    >>> import tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "lock"
+    ...     release_lock(path, acquire_lock(path))
+    ...     path.exists()
+    False
+    """
     if _is_there(path, descriptor):
         path.unlink()
     os.close(descriptor)

@@ -107,7 +107,7 @@ class DrivingLog:
 
     vehicle: VehiclePath | None = None
     """None: the log tells where its cameras were, but not the car that carried them."""
-    kept: Kept = NOTHING
+    kept: Kept = field(default=NOTHING, compare=False)
     """What earlier runs found out about this very log; who changes its frames or boxes takes a new one. By default
     nothing is kept."""
 

@@ -54,6 +54,9 @@ class LeaveOneOutSums:
 
     The same as ``leave_one_out`` says, but lists and image of the rendering are there already: that leaves one loop
     over the pixels.
+
+    >>> LeaveOneOutSums(torch.ones(3, 4, 6)).found is None  # until splat(..., changes=...) and its backward pass
+    True
     """
 
     pixel_weights: Float[Tensor, "3 h w"]

@@ -25,7 +25,7 @@ def test_main_size_has_a_peer_and_a_floor(tmp_path, monkeypatch):
     main, training = read_records(file.path)
     assert set(main["peer"]) == {"forward", "both"}
     samples = main["times"]["samples"]
-    assert main["floor_ms"] == pytest.approx({"blend": 30e3 * samples / 1e11, "blend_backward": 57e3 * samples / 1e11})
+    assert main["floor_ms"] == pytest.approx({"blend": 36e3 * samples / 1e11, "blend_backward": 65e3 * samples / 1e11})
     assert main["difference"]["pixels"] == 64 * 48
     assert main["difference"]["largest_without_ties"] <= 1e-5
     assert training["peer"] is None
