@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from sparsestreet.atomic import check_regular
+from sparsestreet.data.images import WHITE
 from sparsestreet.data.lazy import Frames, Sweeps, spread
 from sparsestreet.data.log import DrivingLog, Split
 from sparsestreet.data.problems import attempt, fault
@@ -79,15 +80,18 @@ def color_points(
     """RGB in [0, 1] from the pixel each point falls into, and which points any camera sees; the others are gray.
 
     ``places``: where the points are in each of the frames; None: in all of them where they were measured. Where several
-    cameras see a point the first one counts. As in DriveStudio nothing tests whether the camera's view
-    of the point is blocked: lidar and cameras sit close together. But the recording car (``Frame.ego``) hides points.
+    cameras see a point the first one counts in whose image it is not cut off at white. As in DriveStudio nothing tests
+    whether the camera's view of the point is blocked: lidar and cameras sit close together. But the recording car
+    (``Frame.ego``) hides points.
     """
     colors = torch.full((points.shape[0], 3), 0.5)
-    colored = torch.zeros(points.shape[0], dtype=torch.bool)
+    colored, cut_off = torch.zeros(2, points.shape[0], dtype=torch.bool)
     for frame, seen in zip(frames, places or [points] * len(frames), strict=True):
         rows, pixels, _ = visible_pixels(frame.camera, seen, frame.ego)
-        new = ~colored[rows]
-        colors[rows[new]] = frame.image.reshape(-1, 3)[pixels[new]].float() / 255
+        shown = frame.image.reshape(-1, 3)[pixels]
+        white = (shown >= WHITE).any(-1)
+        new = ~colored[rows] | (cut_off[rows] & ~white)
+        colors[rows[new]], cut_off[rows[new]] = shown[new].float() / 255, white[new]
         colored[rows] = True
     return colors, colored
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
+from sparsestreet.data.images import WHITE
 from sparsestreet.triangulation.matches import NEAREST, Features, guided_matches, image_pairs, in_image
 from sparsestreet.types import View
 
@@ -369,7 +370,10 @@ def _gathered(
     pixel_sizes = np.full(count, np.inf)
     np.minimum.at(pixel_sizes, point, depth / observations.focal)
     colors = np.concatenate([np.zeros((0, 3), np.float32), *(sighting.colors for sighting in sightings)])[features]
-    mean = summed(colors, point, count) / np.maximum(np.bincount(point, minlength=count), 1)[:, None]
+    # A view in which a channel is cut off at white counts where no other shows the point.
+    weights = np.where((colors >= WHITE / 255).any(1), 1e-6, 1.0)
+    mean = summed(weights[:, None] * colors, point, count)
+    mean /= np.maximum(np.bincount(point, weights, minlength=count), 1e-12)[:, None]
     pixels = np.concatenate([np.zeros((0, 2)), *(sighting.features.pixels for sighting in sightings)])[features]
     return TriangulatedPoints(
         positions[good].astype(np.float32),

@@ -36,6 +36,16 @@ def test_the_first_camera_counts_and_others_fill_in():
     assert torch.equal(colors, torch.stack((IMAGE[1, 1], IMAGE[1, 1] + 50)).float() / 255)
 
 
+def test_an_image_that_is_white_there_counts_where_no_other_shows_the_point():
+    """Of one channel, too; of several white ones the first."""
+    point = torch.tensor([[0.0, 0.2, 1.0]])
+    white, other, gray = IMAGE.clone(), IMAGE.clone(), IMAGE + 100
+    white[1, 1, 2], other[1, 1, 0] = 250, 255
+    for images, wanted in (((white, other), white), ((white, gray, IMAGE), gray), ((gray, white), gray)):
+        colors, _ = color_points(point, [frame(image=image) for image in images])
+        assert torch.equal(colors[0], wanted[1, 1].float() / 255)
+
+
 def test_the_nearest_point_wins_in_any_order():
     points = torch.tensor([[0.0, 0.2, 4.0], [0.0, 0.2, 1.0], [0.0, 0.2, 2.0], [-0.7, -0.4, 1.0]])
     expected = torch.tensor([[1.0, 0, 0], [0, 1.0, 0]])

@@ -87,6 +87,20 @@ def test_colors_are_the_mean_and_sizes_those_of_the_nearest_view():
         np.testing.assert_allclose(found.pixel_sizes[number], nearest / FOCAL, rtol=1e-3)
 
 
+def test_views_in_which_a_point_is_white_have_no_part_in_its_color():
+    points, described, _ = _world()
+    poses = [pose(x=0.8 * i, z=0.4 * i) for i in range(4)]
+    sightings = _sightings(points, described, poses)
+    white = [replace(one, colors=np.full_like(one.colors, 250 / 255)) for one in sightings]
+    usual, some, none = (triangulate(made, SETTINGS) for made in (sightings[:], [*white[:2], *sightings[2:]], white))
+    assert len(usual) == len(some) > 10
+    for number in range(len(some)):
+        seen = [view for view in some.views[some.observed == number] if view >= 2]
+        green = usual.colors[number, 0] + np.mean(seen) / 100 if seen else 250 / 255
+        np.testing.assert_allclose(some.colors[number, 1], green, atol=1e-5)
+    np.testing.assert_allclose(none.colors, 250 / 255, atol=1e-6)
+
+
 def test_a_row_of_equal_windows_gives_no_wrong_point():
     rng = np.random.default_rng(0)
     windows = np.stack((np.arange(-3, 6) * 0.7, np.zeros(9), np.full(9, 10.0)), 1)

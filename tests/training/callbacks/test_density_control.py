@@ -123,8 +123,9 @@ def test_rows_of_what_stands_still_lie_along_a_curve():
     node, cars = background(8, density=KEEPS_ALL), rigid(8, density=KEEPS_ALL)
     corners = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)
     mixed = torch.randperm(8, generator=torch.Generator().manual_seed(1))
-    set_rows(node, "means", dict(enumerate(corners[mixed])))
-    set_rows(cars, "means", {row: torch.tensor([0.4 * (-1.0) ** row, 0.0, 0.0]) for row in range(8)})
+    with torch.no_grad():
+        node.rows.means.copy_(corners[mixed])
+        cars.rows.means.copy_(0.4 * corners[mixed])
     trainer, _, _ = started(every_ten(), background=node, rigid=cars)
     trainer.walk(10)
     steps = node.rows.means.diff(dim=0).abs().sum(1)
