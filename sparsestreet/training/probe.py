@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import DrivingLog
+from sparsestreet.kept import NOTHING
 from sparsestreet.metrics.image import psnr_on_device
 from sparsestreet.scene.build import build_scene
 from sparsestreet.scene.effects import EffectPlan, ProbedGain
@@ -84,7 +85,9 @@ class Probe:
             for out in (False, True)
         )
         train = self.frames.where(lambda view: view.indices[0] not in own)
-        scene = build_scene(self.log, train, self.held_out | own, self.nodes, plan, self.seed)
+        # What it measures is of fewer images than the run has: none of it may be kept for the run.
+        alone = replace(self.log, kept=NOTHING)
+        scene = build_scene(alone, train, self.held_out | own, self.nodes, plan, self.seed)
         self._train(scene, seen)
         with torch.no_grad():
             return torch.stack([self._quality(scene, frame) for frame in unseen])

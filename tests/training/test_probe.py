@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.kept import Kept
 from sparsestreet.scene.effects import ExposureSettings, Finding, ProbedGain
 from sparsestreet.scene.nodes import BackgroundSettings
 from sparsestreet.training import probe as probe_module
@@ -30,6 +31,12 @@ def recipe(when: Literal["auto", "on", "off"] = "auto") -> Recipe:
     return Recipe(NODES, effects, losses={"photometric": Photometric()}, seed=3)
 
 
+def probe_of(data: StreetData) -> Probe:
+    parts = recipe()
+    log, optimizer = data.driving_log, parts.optimizer
+    return Probe(log, data.split.train, frozenset(), NODES, parts.losses, optimizer, parts.options, parts.seed)
+
+
 @pytest.mark.lengthy
 def test_gains_that_images_have_are_worth_their_effect_and_others_are_not(monkeypatch):
     monkeypatch.setattr(probe_module, "STEPS", 40)
@@ -37,11 +44,7 @@ def test_gains_that_images_have_are_worth_their_effect_and_others_are_not(monkey
     found = {}
     for size in (0.15, 0.0):
         data = StreetData(log_of(wave(size)), stride=0)
-        parts = recipe()
-        probe = Probe(
-            data.driving_log, data.split.train, frozenset(), NODES, parts.losses, parts.optimizer, parts.options, 3
-        )
-        found[size] = probe.gain(recipe(when="off").plan(data), "exposure")
+        found[size] = probe_of(data).gain(recipe(when="off").plan(data), "exposure")
     planted, none = found.values()
     assert planted is not None
     assert none is not None
@@ -49,6 +52,17 @@ def test_gains_that_images_have_are_worth_their_effect_and_others_are_not(monkey
     assert planted.mean > 1
     assert planted.images == none.images == 2 * 3  # of both cameras at instants 2, 6 and 10
     assert abs(none.mean) < 0.2
+
+
+def test_what_a_probe_measures_on_fewer_images_is_not_kept_for_the_run(monkeypatch, tmp_path):
+    monkeypatch.setattr(probe_module, "STEPS", 1)
+    monkeypatch.setattr(probe_module, "EVERY", 4)
+    data = StreetData(replace(log_of(wave(0.1)), kept=Kept(tmp_path, "wall")), stride=0)
+    plan, kept = recipe(when="off").plan(data), data.driving_log.kept
+    first = probe_of(data).kept_gain(plan, "exposure")
+    assert set(kept.made) == {"bounds", "probe-exposure"}  # the first of the whole log
+    monkeypatch.setattr(Probe, "gain", lambda *args: pytest.fail("it is kept"))
+    assert probe_of(data).kept_gain(plan, "exposure") == first
 
 
 @pytest.mark.parametrize(
