@@ -77,6 +77,11 @@ class Probe:
         instants = sorted({view.indices[0] for view in self.frames.views})
         return frozenset(instants[EVERY // 2 : -1 : EVERY])
 
+    @cached_property
+    def _options(self) -> RenderOptions:
+        """Those of the run, but for a backend that may not draw on a CPU."""
+        return replace(self.options, backend="auto")
+
     def _psnr(self, plan: EffectPlan) -> Float[Tensor, " n"]:
         """Train the scene of a plan; return the quality of each held-out image."""
         own = self._own_held_out
@@ -104,7 +109,7 @@ class Probe:
             order = order or torch.randperm(len(frames), generator=generator).tolist()
             frame = frames[order.pop()]
             state = SceneState(step / STEPS, 0, step=step)
-            rendering = render(scene, frame, state, self.options)
+            rendering = render(scene, frame, state, self._options)
             seen, recorded = without_hood(rendering, frame)
             terms = [loss(seen, recorded, scene) for loss in self.losses.values() if loss.applies(frame)]
             terms += scene.regularizers(frame, rendering.parts, rendering.drawn, state).values()
@@ -114,7 +119,7 @@ class Probe:
             optimizer.zero_grad(set_to_none=True)
 
     def _quality(self, scene: SceneGraph, frame: Frame) -> Float[Tensor, ""]:
-        rendering, recorded = without_hood(render(scene, frame, SceneState(1.0, 0), self.options), frame)
+        rendering, recorded = without_hood(render(scene, frame, SceneState(1.0, 0), self._options), frame)
         return psnr_on_device(rendering.rgb.clamp(0, 1), recorded.image.to(rendering.rgb.dtype) / 255)
 
 

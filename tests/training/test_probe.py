@@ -10,6 +10,7 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.kept import Kept
 from sparsestreet.scene.effects import ExposureSettings, Finding, ProbedGain
 from sparsestreet.scene.nodes import BackgroundSettings
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training import probe as probe_module
 from sparsestreet.training.losses import Photometric
 from sparsestreet.training.probe import Probe
@@ -34,7 +35,8 @@ def recipe(when: Literal["auto", "on", "off"] = "auto") -> Recipe:
 def probe_of(data: StreetData) -> Probe:
     parts = recipe()
     log, optimizer = data.driving_log, parts.optimizer
-    return Probe(log, data.split.train, frozenset(), NODES, parts.losses, optimizer, parts.options, parts.seed)
+    options = RenderOptions(backend="triton")  # of a run on a GPU
+    return Probe(log, data.split.train, frozenset(), NODES, parts.losses, optimizer, options, parts.seed)
 
 
 @pytest.mark.lengthy
