@@ -285,7 +285,7 @@ class DensityControl(Callback, RowListener):
 def _along_curve(plan: RowPlan, means: Tensor) -> RowPlan:
     """Return the plan with its rows along a curve that fills space: a tile's splats then lie near each other in memory.
 
-    A frame of 130,000 rows takes 24 % less time so, a step 5 % (docs/scaling.md).
+    A frame of 135,484 rows takes 22 % less time so (docs/time_and_memory.md).
     """
     kept = plan.edits.get("means", means.detach()[plan.source])
     order = curve_order(kept.double().cpu().numpy())
