@@ -371,21 +371,21 @@ def collect(
 
 def kept_returns(
     kept: Kept,
-    sweeps: Sweeps,
-    frames: Frames,
+    make: Callable[[], StreetReturns],
     moving: Sequence[Track],
     rigid: Sequence[Track],
-    settings: MovedViews,
-    seed: int,
-    gain: Gain,
+    *said: object,
 ) -> StreetReturns:
-    """Return those of ``collect``, with its arguments; from an earlier run on the same log, if one kept them."""
+    """Return what ``make`` collects of these objects; from an earlier run on the same log, if one kept it.
+
+    ``said``: what the answer depends on beside the log and the objects.
+    """
 
     def collected() -> StreetReturns:
-        found = collect(sweeps, frames, moving, rigid, settings, seed, gain)
+        found = make()
         return replace(found, moving=(), carried=_by(found.carried, ()))
 
-    said = moving, rigid, settings, seed, torch.stack([gain(view) for view in frames.views])
+    said = moving, rigid, *said
     found = kept.get("returns", said, collected, StreetReturns, Returns, Colors, CarriedPoints)
     return replace(found, moving=tuple(moving), carried=_by(found.carried, rigid))
 

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -18,7 +19,7 @@ from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import NodeSettings, RigidSettings
 from sparsestreet.scene.rendering import SceneRendering, from_another_camera
-from sparsestreet.training.moved_views.returns import NEAREST, MovedViews, StreetReturns, kept_returns, target
+from sparsestreet.training.moved_views.returns import NEAREST, MovedViews, StreetReturns, collect, kept_returns, target
 from sparsestreet.types import Camera, Frame, View
 
 _log = logging.getLogger(__name__)
@@ -148,7 +149,10 @@ def moved_view_term(
     moving = [track for track in log.tracks if track.name in taken or displacement(track) > MOVES]
     moving, rigid = without_frames(moving, held_out), without_frames(rigid, held_out)
     with stage("points"), torch.no_grad():
-        returns = kept_returns(log.kept, sweeps, data.split.train, moving, rigid, settings, seed, scene.gain)
+        frames = data.split.train
+        make = partial(collect, sweeps, frames, moving, rigid, settings, seed, scene.gain)
+        gains = torch.stack([scene.gain(view) for view in frames.views])
+        returns = kept_returns(log.kept, make, moving, rigid, settings, seed, gains)
     _log.info(
         "views beside the path: %s returns of the street, of mean weight %.2f (1: an image before or after shows the "
         "same color)",
