@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Int
@@ -21,6 +21,49 @@ from sparsestreet.types import Frame
 logger = logging.getLogger(__name__)
 
 HOST = torch.device("cpu")
+
+
+@dataclass
+class Draws:
+    """Which of ``count`` frames each draw of a training takes: a new random order each epoch, shared by processes."""
+
+    count: int
+    seed: int
+    with_replacement: bool = False
+    ranks: Ranks = ALONE
+    _orders: dict[int, list[int]] = field(default_factory=dict, init=False)
+
+    def place(self, draw: int) -> int:
+        """Return which frame a draw of this process takes, of all its draws since the start of training."""
+        epoch, position = divmod(draw * self.ranks.size + self.ranks.rank, self.count)
+        order = self._orders.get(epoch)
+        if order is None:
+            order = self.order(epoch)
+            # Draws ahead are of this epoch and the next ones; earlier ones do not come again.
+            self._orders = {other: kept for other, kept in self._orders.items() if other == epoch - 1} | {epoch: order}
+        return order[position]
+
+    def order(self, epoch: int) -> list[int]:
+        """Return the frames of an epoch in the order in which all processes draw them."""
+        # One stream of the seed, of which epoch e takes the e-th permutation: seeds 0 and 1 share no epoch.
+        generator = torch.Generator().manual_seed(self.seed)
+        for _ in range(epoch):
+            self._draw(generator)
+        return self._draw(generator).tolist()
+
+    def last(self, end: int) -> frozenset[int]:
+        """Return what ``ShuffledFrames.last_draws`` does."""
+        count, size, stop = self.count, self.ranks.size, end * self.ranks.size
+        # Without replacement every frame is drawn in the last two epochs.
+        first = 0 if self.with_replacement else max(stop // count - 1, 0)
+        drawn = [place for epoch in range(first, -(-stop // count)) for place in self.order(epoch)]
+        last = {place: number for number, place in enumerate(drawn[: stop - first * count], first * count)}
+        return frozenset(number // size for number in last.values() if number % size == self.ranks.rank)
+
+    def _draw(self, generator: torch.Generator) -> Int[Tensor, " n"]:
+        if self.with_replacement:
+            return torch.randint(self.count, (self.count,), generator=generator)
+        return torch.randperm(self.count, generator=generator)
 
 
 class ShuffledFrames:
@@ -57,13 +100,12 @@ class ShuffledFrames:
             threads: as in ``Prefetcher``.
         """
         self.frames = frames
-        self._ranks, self._accumulated = ranks, accumulated
-        self.seed = seed
+        self._accumulated = accumulated
         self._drawn = 0
         self._finished = finished
-        self._with_replacement = with_replacement
-        self._orders: dict[int, list[int]] = {}
-        self._ahead = Prefetcher(lambda draw: frames[self._place(draw)], device, threads)
+        self._draws = draws = Draws(len(frames), seed, with_replacement, ranks)
+        # Of ``self`` it knows nothing, so that its threads end where ``self`` is dropped.
+        self._ahead = Prefetcher(lambda draw: frames[draws.place(draw)], device, threads)
 
     def __len__(self) -> int:
         return len(self.frames) * self._accumulated
@@ -79,39 +121,11 @@ class ShuffledFrames:
         """Ends the threads that read; another iteration starts new ones."""
         self._ahead.close()
 
-    def _place(self, draw: int) -> int:
-        """Which frame a draw takes, of all draws since the start of training."""
-        epoch, position = divmod(draw * self._ranks.size + self._ranks.rank, len(self.frames))
-        order = self._orders.get(epoch)
-        if order is None:
-            order = self._order(epoch)
-            # Draws ahead are of this epoch and the next ones; earlier ones do not come again.
-            self._orders = {other: kept for other, kept in self._orders.items() if other == epoch - 1} | {epoch: order}
-        return order[position]
-
-    def _order(self, epoch: int) -> list[int]:
-        # One stream of the seed, of which epoch e takes the e-th permutation: seeds 0 and 1 share no epoch.
-        generator = torch.Generator().manual_seed(self.seed)
-        for _ in range(epoch):
-            self._draw(generator)
-        return self._draw(generator).tolist()
-
-    def _draw(self, generator: torch.Generator) -> Int[Tensor, " n"]:
-        count = len(self.frames)
-        if self._with_replacement:
-            return torch.randint(count, (count,), generator=generator)
-        return torch.randperm(count, generator=generator)
-
     def last_draws(self, end: int) -> frozenset[int]:
         """Return this process's draws before ``end`` whose frames no process draws once more before that.
 
         Every frame is among those of all processes once, unless it was never drawn."""
-        count, size, stop = len(self.frames), self._ranks.size, end * self._ranks.size
-        # Without replacement every frame is drawn in the last two epochs.
-        first = 0 if self._with_replacement else max(stop // count - 1, 0)
-        drawn = [place for epoch in range(first, -(-stop // count)) for place in self._order(epoch)]
-        last = {place: number for number, place in enumerate(drawn[: stop - first * count], first * count)}
-        return frozenset(number // size for number in last.values() if number % size == self._ranks.rank)
+        return self._draws.last(end)
 
     def state_dict(self) -> dict[str, int]:
         return {"finished": self._drawn if self._finished is None else self._finished()}
