@@ -176,7 +176,8 @@ class StreetSystem(LightningModule):
         return self.optimizer_settings.build(self.scene, self.radius, images_per_step(self.trainer))
 
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
-        set_rates(self.trainer.optimizers[0], self.state().progress)
+        state = self.state()
+        set_rates(self.trainer.optimizers[0], state.progress, state.step)
 
     def on_train_batch_end(self, outputs: object, batch: Frame, batch_idx: int) -> None:
         if self.said.is_there and ends_step(self.trainer, batch_idx):
