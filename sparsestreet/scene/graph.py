@@ -76,6 +76,8 @@ class SceneGraph(nn.Module):
         return SceneGaussians(gaussians, spans, parts, view, self._gates(state) if state.training else None)
 
     def _activated(self, parts: Sequence[RawGaussians], state: SceneState) -> Gaussians:
+        if state.harmonics_rest:
+            parts = [replace(part, sh_rest=part.sh_rest.detach()) for part in parts]
         return activate(parts, sh_degree=state.sh_degree)
 
     def exposed(self, view: View) -> Exposed | None:

@@ -21,21 +21,12 @@ class LearningRate:
     """Whether the rate is multiplied by the scene radius (meters), as 3DGS does for the means."""
     start: float = 0.0
     """Fraction of the run before which the rate is 0; the decay still counts from the start of the run."""
-    every: int = 1
-    """Steps from one that moves the parameter to the next, once ``every_from`` of the run is done; between them its
-    values and moments rest, and their gradients are dropped. Adam reads and writes 28 bytes a number."""
-    every_from: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.initial > 0 or (self.final is not None and not self.final > 0):
             raise ValueError(f"learning rates must be > 0, got initial={self.initial} and final={self.final}")
         if not 0 <= self.start <= 1:
             raise ValueError(f"a learning rate starts at a fraction of the run in [0, 1], got start={self.start}")
-        if self.every < 1 or not 0 <= self.every_from <= 1:
-            raise ValueError(
-                "a parameter moves every so many steps, 1 or more, from a fraction of the run in [0, 1] on, "
-                f"got every={self.every} and every_from={self.every_from}"
-            )
 
     @classmethod
     def of(cls, said: "LearningRate | Mapping[str, Any]") -> "LearningRate":
@@ -55,15 +46,6 @@ class LearningRate:
             return 1.0
         return (self.final / self.initial) ** min(max(progress, 0.0), 1.0)
 
-    def rests(self, progress: float, step: int) -> bool:
-        """Return whether the parameter rests in a step (0 is the first) at a progress in [0, 1].
-
-        >>> rate = LearningRate(0.01, every=2, every_from=0.5)
-        >>> [rate.rests(step / 6, step) for step in range(6)]
-        [False, False, False, True, False, True]
-        """
-        return progress >= self.every_from and step % self.every != 0
-
 
 Rates = Mapping[str, LearningRate | Mapping[str, Any]]
 """Name -> rate, or a mapping of the rate's fields."""
@@ -79,8 +61,8 @@ def rates_of(said: Rates) -> dict[str, LearningRate]:
 
 
 def usual_rates() -> dict[str, LearningRate]:
-    """Return the rates of conf/schedule/short.yaml: for Gaussians twice those of 3DGS (Kerbl et al. 2023), four
-    times for log_scales.
+    """Return the rates of conf/schedule/short.yaml: for Gaussians twice those of 3DGS (Kerbl et al. 2023), for
+    log_scales four times.
 
     >>> usual_rates()["opacity_logits"].initial
     0.1
@@ -91,7 +73,7 @@ def usual_rates() -> dict[str, LearningRate]:
         "quaternions": LearningRate(2e-3),
         "opacity_logits": LearningRate(1e-1),
         "sh_dc": LearningRate(5e-3),
-        "sh_rest": LearningRate(2.5e-4, every=2, every_from=0.36),
+        "sh_rest": LearningRate(2.5e-4),
         "mask_features": LearningRate(1e-3),
         "mask": LearningRate(1.6e-3),
         "mask_logits": LearningRate(3e-2),

@@ -26,10 +26,10 @@ class RefusedRows:
 class RowAdam(torch.optim.Adam):
     """torch.optim.Adam, but for rows whose gradient holds a NaN or an infinity: their values and moments rest.
 
-    A row is an entry of a parameter's first dimension. A group that ``rests`` is left alone. ``refused`` says what the
-    last step left alone; it lies on the device, and reading it waits. State is kept as torch.optim.Adam keeps it, so
-    that checkpoints fit both; ``step`` is on the host, where the bias corrections are computed. On the CPU with the C++
-    library the bits are those of torch's fused Adam; on a GPU Triton's differ from them by rounding.
+    A row is an entry of a parameter's first dimension. ``refused`` says what the last step left alone; it lies on the
+    device, and reading it waits. State is kept as torch.optim.Adam keeps it, so that checkpoints fit both; ``step`` is
+    on the host, where the bias corrections are computed. On the CPU with the C++ library the bits are those of torch's
+    fused Adam; on a GPU Triton's differ from them by rounding.
     """
 
     def __init__(
@@ -52,8 +52,7 @@ class RowAdam(torch.optim.Adam):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        moving = [group for group in self.param_groups if not group.get("rests", False)]
-        held = [(one, group) for group in moving for one in group["params"] if one.grad is not None]
+        held = [(one, group) for group in self.param_groups for one in group["params"] if one.grad is not None]
         device = held[0][0].device if held else torch.device("cpu")
         counts = torch.zeros(len(held), 2, dtype=torch.int64, device=device)
         counts[:, 1] = NONE

@@ -64,12 +64,11 @@ class OptimizerSettings:
         return RowAdam(groups.values(), betas=betas, eps=self.eps)
 
 
-def set_rates(optimizer: torch.optim.Optimizer, progress: float, step: int) -> None:
-    """Give every group its rate in a step (0 is the first) at a progress in [0, 1], and say whether it rests.
+def set_rates(optimizer: torch.optim.Optimizer, progress: float) -> None:
+    """Give every group its rate at a progress in [0, 1].
 
     Without state, rather than by a scheduler: groups come and go with the masks, and a resumed run needs nothing but
     its step.
     """
     for group in optimizer.param_groups:
-        rate = LearningRate(**group["rate"])
-        group["lr"], group["rests"] = group["initial_lr"] * rate.factor(progress), rate.rests(progress, step)
+        group["lr"] = group["initial_lr"] * LearningRate(**group["rate"]).factor(progress)

@@ -113,7 +113,7 @@ class Probe:
             seen, recorded = without_hood(rendering, frame)
             terms = [loss(seen, recorded, scene) for loss in self.losses.values() if loss.applies(frame)]
             terms += scene.regularizers(frame, rendering.parts, rendering.drawn, state).values()
-            set_rates(optimizer, state.progress, step)
+            set_rates(optimizer, state.progress)
             torch.stack(terms).sum().backward()
             optimizer.step()
             optimizer.zero_grad(set_to_none=True)

@@ -38,6 +38,10 @@ class Recipe:
     options: RenderOptions = DEFAULT_OPTIONS
     sh_interval: float = 0.0333
     """Fraction of the run after which one more degree of spherical harmonics is used."""
+    sh_every: int = 2
+    """Steps from one that moves the coefficients after the first to the next, from ``sh_every_from`` on."""
+    sh_every_from: float = 0.36
+    """Fraction of the run: where growth ends."""
     resolution: ResolutionSchedule = field(default_factory=ResolutionSchedule)
     """Size of the images that steps train on; by default they are whole."""
     seed: int = 0
@@ -133,6 +137,8 @@ class Recipe:
             radius=log.radius,
             options=self.options,
             sh_interval=self.sh_interval,
+            sh_every=self.sh_every,
+            sh_every_from=self.sh_every_from,
             resolution=self.resolution,
             moved_views=None
             if self.moved_views is None

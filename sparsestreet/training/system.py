@@ -48,6 +48,8 @@ class StreetSystem(LightningModule):
         radius: float,
         options: RenderOptions = DEFAULT_OPTIONS,
         sh_interval: float = 1 / 30,
+        sh_every: int = 1,
+        sh_every_from: float = 0.0,
         resolution: ResolutionSchedule | None = None,
         moved_views: MovedViewTerm | None = None,
     ) -> None:
@@ -60,21 +62,27 @@ class StreetSystem(LightningModule):
             radius: of the scene, meters.
             options: how it is rendered.
             sh_interval: fraction of the run after which one more degree of spherical harmonics is used.
+            sh_every: steps from one that moves the coefficients after the first to the next. They are three quarters of
+                all numbers, of which Adam reads and writes 28 bytes each.
+            sh_every_from: fraction of the run before which every step moves them.
             resolution: size of the images that steps train on; None: whole.
             moved_views: the terms of views beside the path; None: there are none.
 
         Raises:
-            ValueError: if the interval is not positive.
+            ValueError: if the interval is not positive, or harmonics would never move.
         """
         super().__init__()
         if not sh_interval > 0:
             raise ValueError(f"sh_interval must be > 0, got {sh_interval}: a tiny one uses all degrees from the start")
+        if sh_every < 1:
+            raise ValueError(f"sh_every must be >= 1 step, got {sh_every}: 1 moves all coefficients in every step")
         self.scene = scene
         self.losses = dict(losses)
         self.optimizer_settings = optimizer
         self.radius = radius
         self.options = options
         self.sh_interval = sh_interval
+        self.sh_every, self.sh_every_from = sh_every, sh_every_from
         self.resolution = resolution or ResolutionSchedule()
         self.moved_views = moved_views
         self.rendering: SceneRendering | None = None
@@ -110,6 +118,7 @@ class StreetSystem(LightningModule):
             int(progress / self.sh_interval + 1e-6),
             training,
             training and self.screen_gradients,
+            training and progress >= self.sh_every_from and self.global_step % self.sh_every != 0,
             self.global_step,
         )
 
@@ -176,8 +185,7 @@ class StreetSystem(LightningModule):
         return self.optimizer_settings.build(self.scene, self.radius, images_per_step(self.trainer))
 
     def on_train_batch_start(self, batch: Frame, batch_idx: int) -> None:
-        state = self.state()
-        set_rates(self.trainer.optimizers[0], state.progress, state.step)
+        set_rates(self.trainer.optimizers[0], self.state().progress)
 
     def on_train_batch_end(self, outputs: object, batch: Frame, batch_idx: int) -> None:
         if self.said.is_there and ends_step(self.trainer, batch_idx):

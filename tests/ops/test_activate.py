@@ -206,6 +206,24 @@ def test_coefficients_that_are_not_used_get_no_gradient(backend):
     assert there(v_rest).sum((0, 2)).tolist() == [9.0] * 3 + [0.0] * 12
 
 
+@every_fast_backend
+def test_coefficients_that_rest_change_no_other_gradient(backend):
+    """The first of three parts lets them rest: it gets none, and all else gets what it got."""
+    parts = parts_of_three_kinds(torch.float32, device_of(backend))
+    resting = [replace(parts[0], sh_rest=parts[0].sh_rest.detach()), *parts[1:]]
+
+    def gradients(chosen: list[RawGaussians]) -> list[Tensor | None]:
+        active = activate(chosen, sh_degree=3, backend=backend)
+        total = sum((field * field).sum() for field in vars(active).values() if field is not None)
+        return list(torch.autograd.grad(total, inputs_of(parts), allow_unused=True))
+
+    usual, found = gradients(parts), gradients(resting)
+    place = next(i for i, one in enumerate(inputs_of(parts)) if one is parts[0].sh_rest)
+    assert found.pop(place) is None
+    assert usual.pop(place).abs().sum() > 0
+    assert all(map(torch.equal, found, usual))
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_same_bits_for_any_number_of_threads(dtype):
     parts = case(15, masked=True, placed=True, count=2500, dtype=dtype)

@@ -97,8 +97,6 @@ def test_a_late_start_rests_and_then_is_where_it_would_have_been(final: float | 
         ({"initial": 1.0, "final": 0.0}, "and final=0.0"),
         ({"initial": 1.0, "start": 1.1}, r"in \[0, 1\], got start=1.1"),
         ({"initial": 1.0, "start": -0.1}, r"in \[0, 1\], got start=-0.1"),
-        ({"initial": 1.0, "every": 0}, "got every=0 and every_from=0.0"),
-        ({"initial": 1.0, "every": 2, "every_from": 1.5}, "got every=2 and every_from=1.5"),
     ],
 )
 def test_impossible_rates_are_refused(values: dict, message: str):

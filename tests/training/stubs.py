@@ -126,6 +126,8 @@ def make_system(
     radius: float = 10.0,
     options: RenderOptions | None = None,
     sh_interval: float = 0.1,
+    sh_every: int = 1,
+    sh_every_from: float = 0.0,
     moved_views: MovedViewTerm | None = None,
 ) -> StreetSystem:
     return StreetSystem(
@@ -135,6 +137,8 @@ def make_system(
         radius=radius,
         options=RenderOptions() if options is None else options,
         sh_interval=sh_interval,
+        sh_every=sh_every,
+        sh_every_from=sh_every_from,
         moved_views=moved_views,
     )
 

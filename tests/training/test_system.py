@@ -112,6 +112,24 @@ def test_only_harmonics_in_use_have_a_gradient(step, used):
     assert felt.tolist() == [True] * used + [False] * (15 - used)
 
 
+def test_late_harmonics_rest_between_their_steps():
+    """Every third step from half of ten on; the first coefficient moves in each, and rest has no momentum."""
+    node = background(12)
+    trainer = StubTrainer(make_system({"background": node}, sh_interval=0.01, sh_every=3, sh_every_from=0.5), 10)
+    moved = {"sh_rest": [], "sh_dc": []}
+    for step in range(10):
+        before = {name: getattr(node.rows, name).detach().clone() for name in moved}
+        trainer.train(1, frame_at())
+        for name, steps in moved.items():
+            steps += [step] * (not torch.equal(getattr(node.rows, name), before[name]))
+    assert moved == {"sh_rest": [0, 1, 2, 3, 4, 6, 9], "sh_dc": list(range(10))}
+
+
+def test_harmonics_that_never_move_are_refused():
+    with pytest.raises(ValueError, match="sh_every must be >= 1 step, got 0"):
+        make_system({"background": background(1)}, sh_every=0)
+
+
 def test_nodes_know_whether_they_are_trained():
     node, trainer = watched()
     trainer.train(1, frame_at())

@@ -43,6 +43,8 @@ def recipe_of(cfg: DictConfig) -> Recipe:
         optimizer=instantiate(cfg.optimizer, _convert_="all"),
         options=_render_options(cfg),
         sh_interval=cfg.schedule.sh_interval,
+        sh_every=cfg.schedule.sh_every,
+        sh_every_from=cfg.schedule.sh_every_from,
         resolution=instantiate(cfg.schedule.resolution, _convert_="all"),
         seed=cfg.seed,
         image_points=instantiate(cfg.image_points, _convert_="all") if cfg.image_points else None,

@@ -46,13 +46,15 @@ class _Activate(torch.autograd.Function):
         with phase("scene backward"):
             cotangents = [value.contiguous() for value in cotangents]
             for (rows, part), used in zip(split_parts(ctx.saved_tensors), ctx.terms, strict=True):
-                gradients += _part_backward(ctx, part, used, [value[rows] for value in cotangents])
+                rests = not ctx.needs_input_grad[2 + len(gradients) + 5]
+                gradients += _part_backward(ctx, part, used, [value[rows] for value in cotangents], rests)
         return None, None, *gradients
 
 
-def _part_backward(ctx, part: Inputs, terms: int, cotangents: list[Tensor]) -> list[Tensor | None]:
-    """Gradients of a part's inputs from those of its rows."""
-    gradients: list[Tensor | None] = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:LEARNED]]
+def _part_backward(ctx, part: Inputs, terms: int, cotangents: list[Tensor], rests: bool) -> list[Tensor | None]:
+    """Gradients of a part's inputs from those of its rows; none of the coefficients after the first where they rest."""
+    wanted = [None if rests and place == 5 else tensor for place, tensor in enumerate(part[:LEARNED])]
+    gradients: list[Tensor | None] = [None if tensor is None else torch.empty_like(tensor) for tensor in wanted]
     placed = part[LEARNED] is not None
     if not placed:
         # Means and quaternions passed through unchanged.
