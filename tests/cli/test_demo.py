@@ -50,6 +50,7 @@ def test_three_runs_one_table_and_pictures(asked, monkeypatch, capsys):
     names = ("none", "paper_short", "removal")
     assert commands == [
         [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1200", "overwrite=true",
+         "data.log.settings.width=240", "data.log.settings.height=144", "data.log.settings.num_frames=30",
          f"out={out / name}", "seed=1", "schedule.max_steps=20"]
         for name in names
     ]  # fmt: skip
@@ -58,13 +59,21 @@ def test_three_runs_one_table_and_pictures(asked, monkeypatch, capsys):
         (runs, out / "comparison.png"),
         {"legend": node_legend({"background": 7, "rigid": 2}), "titles": TITLES},
     )
-    assert words == [*map(str, runs), "baseline=plain", "markdown=outputs/demo/table.md"]
+    assert words == ["sweep=outputs/demo"]
     said = capsys.readouterr().out
-    assert "pictures: outputs/demo/comparison.png, outputs/demo/removal/pictures/sheet.png (" in said
+    assert "pictures: outputs/demo/comparison.png, outputs/demo/removal/pictures/sheet.png\n" in said
+    assert "in a browser: outputs/demo/report/index.html (" in said
     assert "sparsestreet render scene=outputs/demo/removal path=shifted offset=1.5 out=drive.mp4" in said
     assert [f"== sparsify={name} ==" in said for name in names] == [True] * 3
 
 
+def test_another_log_has_its_own_size(asked, monkeypatch):
+    monkeypatch.setattr(module, "report", lambda words: 0)
+    assert demo(["data=auto", "data.root=x"]) == 0
+    assert not any("settings" in word for command in asked[:3] for word in command)
+
+
+@pytest.mark.lengthy
 def test_the_one_comparison_is_the_last_table(asked, tmp_path, capsys):
     """Headed by words, with the mark of times that were disturbed; the long tables come before it."""
     (tmp_path / "d").mkdir()  # the sheet would be there
