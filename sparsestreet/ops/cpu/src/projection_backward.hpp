@@ -4,6 +4,7 @@
 #include <omp.h>
 
 #include "prepare.hpp"
+#include "stream.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -117,13 +118,11 @@ struct Outputs {
         scales(static_cast<T*>(g.scales)), opacities(static_cast<T*>(g.opacities)), sh(static_cast<T*>(g.sh)),
         screen(static_cast<T*>(g.screen)) {}
 
-  void set_zero(int64_t row) const {
-    std::memset(static_cast<void*>(means + 3 * row), 0, 3 * sizeof(T));
-    std::memset(static_cast<void*>(quaternions + 4 * row), 0, 4 * sizeof(T));
-    std::memset(static_cast<void*>(scales + 3 * row), 0, 3 * sizeof(T));
-    std::memset(static_cast<void*>(sh + 3 * terms * row), 0, 3 * terms * sizeof(T));
-    std::memset(static_cast<void*>(screen + 2 * row), 0, 2 * sizeof(T));
-    opacities[row] = 0;
+  void set_zero(int64_t first, int64_t last) const {
+    const auto zero = [&](T* values, int64_t width) {
+      stream<T>(values + width * first, nullptr, width * (last - first));
+    };
+    zero(means, 3), zero(quaternions, 4), zero(scales, 3), zero(opacities, 1), zero(sh, 3 * terms), zero(screen, 2);
   }
 };
 
@@ -167,8 +166,8 @@ void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Input
   store_columns<T>(camera.plain_gradients ? &g.x : &g.abs_x, 2, [&](int r) { return out.screen + 2 * row(r); });
 }
 
-// Rows `range` of the input: culled ones get zeros, the others are gathered until they fill a register. In which lane
-// a row is computed does not change its bits.
+// Rows `range` of the input: culled ones, which neighbor each other, get zeros, the others are gathered until they fill
+// a register. In which lane a row is computed does not change its bits.
 template <class E, class T>
 void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
                     const Range& range) {
@@ -176,12 +175,15 @@ void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Input
   int count = 0;
   for (int64_t i = range.begin; i < range.end; ++i) {
     if (ws.tiles[i].count == 0) {
-      out.set_zero(i);
+      const int64_t first = i;
+      while (i + 1 < range.end && ws.tiles[i + 1].count == 0) ++i;
+      out.set_zero(first, i + 1);
       continue;
     }
     rows[count++] = i;
     if (count == LANES<T>) backward_block<E>(ws, camera, in, out, rows), count = 0;
   }
+  end_stream();
   if (count == 0) return;
   for (int lane = count; lane < LANES<T>; ++lane) rows[lane] = rows[count - 1];
   backward_block<E>(ws, camera, in, out, rows);
