@@ -61,15 +61,14 @@ def rates_of(said: Rates) -> dict[str, LearningRate]:
 
 
 def usual_rates() -> dict[str, LearningRate]:
-    """Return the rates of conf/schedule/short.yaml: for Gaussians twice those of 3DGS (Kerbl et al. 2023), for
-    log_scales four times.
+    """Return the rates of conf/schedule/short.yaml: for Gaussians twice those of 3DGS (Kerbl et al. 2023).
 
     >>> usual_rates()["opacity_logits"].initial
     0.1
     """
     return {
         "means": LearningRate(3.2e-4, 3.2e-6, scale_by_scene_radius=True),
-        "log_scales": LearningRate(2e-2),
+        "log_scales": LearningRate(1e-2),
         "quaternions": LearningRate(2e-3),
         "opacity_logits": LearningRate(1e-1),
         "sh_dc": LearningRate(5e-3),
@@ -78,6 +77,15 @@ def usual_rates() -> dict[str, LearningRate]:
         "mask": LearningRate(1.6e-3),
         "mask_logits": LearningRate(3e-2),
     }
+
+
+def usual_background_rates() -> dict[str, LearningRate]:
+    """Return ``usual_rates`` with that of a background's scales (docs/length.md).
+
+    >>> usual_background_rates()["log_scales"].initial
+    0.02
+    """
+    return usual_rates() | {"log_scales": LearningRate(2e-2)}
 
 
 def usual_track_rates() -> dict[str, LearningRate]:

@@ -14,6 +14,7 @@ from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.initialize.gaussians import Points, lie_flat, neighbor_scales, outside_swept_boxes
 from sparsestreet.scene.initialize.sources import FarPoints, ImagePoints, LidarPoints, NearPoints, PointSource, Seeds
 from sparsestreet.scene.initialize.training_data import Coverage, TrainingData, coverage
+from sparsestreet.scene.learning_rate import Rates, usual_background_rates
 from sparsestreet.scene.masks import Mask
 from sparsestreet.scene.nodes.node import Node, NodeSettings
 from sparsestreet.scene.state import SceneState
@@ -53,6 +54,7 @@ class BackgroundSettings(NodeSettings):
     images sets each one's share."""
     sources: Mapping[str, PointSource] = field(default_factory=usual_sources)
     """Name -> source of points. Each draws from its own stream, so changing one leaves the points of the others."""
+    learning_rates: Rates = field(default_factory=usual_background_rates)
     clear_swept_boxes: bool = False
     """Whether a point of any source goes that lies in the box of a moving object at any training frame (DriveStudio):
     what a car drives over starts empty."""
