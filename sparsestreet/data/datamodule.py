@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Int
@@ -23,15 +23,12 @@ logger = logging.getLogger(__name__)
 HOST = torch.device("cpu")
 
 
-@dataclass
 class Draws:
     """Which of ``count`` frames each draw of a training takes: a new random order each epoch, shared by processes."""
 
-    count: int
-    seed: int
-    with_replacement: bool = False
-    ranks: Ranks = ALONE
-    _orders: dict[int, list[int]] = field(default_factory=dict, init=False)
+    def __init__(self, count: int, seed: int, *, with_replacement: bool = False, ranks: Ranks = ALONE) -> None:
+        self.count, self.seed, self.with_replacement, self.ranks = count, seed, with_replacement, ranks
+        self._orders: dict[int, list[int]] = {}
 
     def place(self, draw: int) -> int:
         """Return which frame a draw of this process takes, of all its draws since the start of training."""
@@ -103,7 +100,7 @@ class ShuffledFrames:
         self._accumulated = accumulated
         self._drawn = 0
         self._finished = finished
-        self._draws = draws = Draws(len(frames), seed, with_replacement, ranks)
+        self._draws = draws = Draws(len(frames), seed, with_replacement=with_replacement, ranks=ranks)
         # Of ``self`` it knows nothing, so that its threads end where ``self`` is dropped.
         self._ahead = Prefetcher(lambda draw: frames[draws.place(draw)], device, threads)
 

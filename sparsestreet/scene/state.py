@@ -21,10 +21,10 @@ class SceneState:
     """Whether a training step renders the view; if so, noise and sampling of a node are on."""
     screen_gradients: bool = False
     """Whether density control is running and will read the gradients of the Gaussians' positions on screen."""
-    harmonics_rest: bool = False
-    """Whether the step leaves the coefficients after the first as they are: they get no gradient."""
     step: int = 0
     """Number of optimizer steps before this one, for terms that come at some steps only."""
+    harmonics_rest: bool = False
+    """Whether the step leaves the coefficients after the first as they are: they get no gradient."""
 
 
 FINISHED = SceneState()

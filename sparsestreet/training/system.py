@@ -118,8 +118,8 @@ class StreetSystem(LightningModule):
             int(progress / self.sh_interval + 1e-6),
             training,
             training and self.screen_gradients,
-            training and progress >= self.sh_every_from and self.global_step % self.sh_every != 0,
             self.global_step,
+            training and progress >= self.sh_every_from and self.global_step % self.sh_every != 0,
         )
 
     def training_step(self, frame: Frame, index: int) -> Float[Tensor, ""]:
