@@ -1,4 +1,5 @@
-"""Blocks of a tile that the C++ pixel loops visit: no pixel is lost, and few blocks are visited in vain."""
+"""Blocks of a tile that the C++ pixel loops visit, and runs of rows that no tile has: no pixel and no row is lost, and
+few blocks are visited in vain."""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +12,7 @@ from sparsestreet.ops import SplatSettings, contribution
 from sparsestreet.ops.cpu.library import idle_workspaces, load_library
 from sparsestreet.ops.cpu.rasterizer import rasterize
 from sparsestreet.types import Camera, Gaussians
-from tests.ops.scenes import cast, front_camera, one_gaussian
+from tests.ops.scenes import cast, fill_buffers_with_nan, front_camera, one_gaussian, random_gaussians
 from tests.ops.test_effects_shutter import rolling
 
 WIDTH, HEIGHT = 53, 37  # the last tiles and blocks are cut
@@ -123,3 +124,32 @@ def test_counters_lose_no_pixel(kind):
         counted = contribution(rows, view, settings=SHARP, backend="cpu")
         assert int(counted.pixels[0]) == int((every[1] < 1).sum())
         assert float(counted.weight[0]) == pytest.approx(float((1 - every[1].double()).sum()), rel=1e-5)
+
+
+@every_variant
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("first", [0, 1, 7])
+def test_rows_that_are_not_seen_get_zeros_however_many_lie_together(first, dtype, variant, monkeypatch):
+    """Runs of 1 to 200 rows behind the camera, from odd places on: their gradients go past the caches."""
+    view = front_camera(WIDTH, HEIGHT, 40.0)
+    gaussians = cast(random_gaussians(640, view, terms=16), dtype)
+    hidden = torch.zeros(640, dtype=torch.bool)
+    for start, count in ((first, 1), (first + 3, 6), (first + 20, 33), (first + 90, 200), (638 - first, 2)):
+        hidden[start : start + count] = True
+    fields = [
+        getattr(gaussians, name).detach().clone() for name in ("means", "quaternions", "scales", "opacities", "sh")
+    ]
+    fields[0][hidden, 2] = -5.0
+    alone = [field[~hidden] for field in fields]
+
+    def gradients(given: list[torch.Tensor]) -> list[torch.Tensor]:
+        leaves = [field.clone().requires_grad_() for field in given]
+        offsets = torch.zeros(len(leaves[0]), 2, dtype=dtype, requires_grad=True)
+        drawn = rasterize(Gaussians(*leaves), offsets, view, SplatSettings(), variant)
+        return list(torch.autograd.grad(drawn.rgb.square().sum() + drawn.depth_sum.sum(), [*leaves, offsets]))
+
+    there = gradients(alone)
+    fill_buffers_with_nan(monkeypatch)
+    for found, expected in zip(gradients(fields), there, strict=True):
+        assert torch.equal(found[hidden], torch.zeros_like(found[hidden]))
+        assert torch.equal(found[~hidden], expected)
