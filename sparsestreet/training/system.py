@@ -48,8 +48,8 @@ class StreetSystem(LightningModule):
         radius: float,
         options: RenderOptions = DEFAULT_OPTIONS,
         sh_interval: float = 1 / 30,
-        sh_every: int = 1,
-        sh_every_from: float = 0.0,
+        sh_every: int = 2,
+        sh_every_from: float = 0.36,
         resolution: ResolutionSchedule | None = None,
         moved_views: MovedViewTerm | None = None,
     ) -> None:
@@ -74,8 +74,11 @@ class StreetSystem(LightningModule):
         super().__init__()
         if not sh_interval > 0:
             raise ValueError(f"sh_interval must be > 0, got {sh_interval}: a tiny one uses all degrees from the start")
-        if sh_every < 1:
-            raise ValueError(f"sh_every must be >= 1 step, got {sh_every}: 1 moves all coefficients in every step")
+        if sh_every < 1 or not 0 <= sh_every_from <= 1:
+            raise ValueError(
+                "sh_every must be >= 1 step and sh_every_from a fraction of the run in [0, 1], got "
+                f"{sh_every} and {sh_every_from}: sh_every=1 moves all coefficients in every step"
+            )
         self.scene = scene
         self.losses = dict(losses)
         self.optimizer_settings = optimizer

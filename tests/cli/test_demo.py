@@ -51,7 +51,7 @@ def test_three_runs_one_table_and_pictures(asked, monkeypatch, capsys):
     assert commands == [
         [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1000", "overwrite=true",
          "data.log.settings.width=240", "data.log.settings.height=144", "data.log.settings.num_frames=30",
-         "data.log.settings.num_cameras=2", "node.background.max_gaussians=70000",
+         "data.log.settings.num_cameras=2", "capacity.background.max_gaussians=70000",
          f"out={out / name}", "seed=1", "schedule.max_steps=20"]
         for name in names
     ]  # fmt: skip
@@ -71,7 +71,10 @@ def test_three_runs_one_table_and_pictures(asked, monkeypatch, capsys):
 def test_another_log_has_its_own_size(asked, monkeypatch):
     monkeypatch.setattr(module, "report", lambda words: 0)
     assert demo(["data=auto", "data.root=x"]) == 0
-    assert not any("settings" in word for command in asked[:3] for word in command)
+    assert not set(module.SMALL) & {word for command in asked[:3] for word in command}
+    asked.clear()
+    assert demo(["data=synthetic"]) == 0
+    assert all(set(module.SMALL) <= set(command) for command in asked[:3])
 
 
 @pytest.mark.lengthy

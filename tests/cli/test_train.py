@@ -51,10 +51,10 @@ def test_training_improves_and_leaves_records(finished, tiny_street):
     with (finished / "curves" / "metrics.csv").open() as file:
         psnr = [float(row["psnr"]) for row in csv.DictReader(file) if row["psnr"]]
     (root,) = (Path(word.partition("=")[2]) for word in tiny_street if word.startswith("data.log.root="))
-    # 60 steps from gray, with a reset, which end with 260 Gaussians: 1.4 dB were measured; noise is zero on the CPU.
+    # 60 steps from gray, with a reset: 1.7 dB were measured; noise between runs is zero on the CPU.
     flat = flat_psnr(root)
-    assert summary["quality"]["held_out"]["psnr_full"]["mean"] > flat + 1
-    assert summary["quality"]["training"]["psnr_full"]["mean"] > flat + 1
+    assert summary["quality"]["held_out"]["psnr_full"]["mean"] > flat + 1.5
+    assert summary["quality"]["training"]["psnr_full"]["mean"] > flat + 1.5
     assert psnr
     assert summary["gaussians_total"] == sum(summary["gaussians"].values())
     assert summary["guards"]["alarms"] == {}

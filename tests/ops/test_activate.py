@@ -207,10 +207,12 @@ def test_coefficients_that_are_not_used_get_no_gradient(backend):
 
 
 @every_fast_backend
-def test_coefficients_that_rest_change_no_other_gradient(backend):
-    """The first of three parts lets them rest: it gets none, and all else gets what it got."""
+@pytest.mark.parametrize("part", [0, 2])
+def test_coefficients_that_rest_change_no_other_gradient(backend, part):
+    """The first or the last of three parts lets them rest: it gets none, and all else gets what it got."""
     parts = parts_of_three_kinds(torch.float32, device_of(backend))
-    resting = [replace(parts[0], sh_rest=parts[0].sh_rest.detach()), *parts[1:]]
+    resting = list(parts)
+    resting[part] = replace(parts[part], sh_rest=parts[part].sh_rest.detach())
 
     def gradients(chosen: list[RawGaussians]) -> list[Tensor | None]:
         active = activate(chosen, sh_degree=3, backend=backend)
@@ -218,7 +220,7 @@ def test_coefficients_that_rest_change_no_other_gradient(backend):
         return list(torch.autograd.grad(total, inputs_of(parts), allow_unused=True))
 
     usual, found = gradients(parts), gradients(resting)
-    place = next(i for i, one in enumerate(inputs_of(parts)) if one is parts[0].sh_rest)
+    place = next(i for i, one in enumerate(inputs_of(parts)) if one is parts[part].sh_rest)
     assert found.pop(place) is None
     assert there(usual.pop(place)).abs().sum() > 0
     assert all(torch.equal(there(one), there(other)) for one, other in zip(found, usual, strict=True))

@@ -127,9 +127,10 @@ def test_late_harmonics_rest_between_their_steps():
     assert moved == {"sh_rest": [1, 2, 3, 4, 6, 9], "sh_dc": list(range(10))}
 
 
-def test_harmonics_that_never_move_are_refused():
-    with pytest.raises(ValueError, match="sh_every must be >= 1 step, got 0"):
-        make_system({"background": background(1)}, sh_every=0)
+@pytest.mark.parametrize(("every", "start"), [(0, 0.5), (2, -0.1), (2, 1.5)])
+def test_harmonics_that_never_move_are_refused(every, start):
+    with pytest.raises(ValueError, match=rf"sh_every must be >= 1 step .* got {every} and {start}: sh_every=1"):
+        make_system({"background": background(1)}, sh_every=every, sh_every_from=start)
 
 
 def test_nodes_know_whether_they_are_trained():

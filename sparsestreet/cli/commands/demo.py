@@ -33,7 +33,7 @@ ASSIGNMENT = "all_rigid"
 STEPS = 1000
 SMALL = [
     *(f"data.log.settings.{name}" for name in ("width=240", "height=144", "num_frames=30", "num_cameras=2")),
-    "node.background.max_gaussians=70000",
+    "capacity.background.max_gaussians=70000",
 ]
 """With so many steps, three runs, their pictures and the setting-up in three to four minutes on two cores; a run of
 one's own takes 2,000 steps on 40 frames of three cameras of 320x192, and up to 130,000 Gaussians in the background."""
@@ -50,11 +50,12 @@ def demo(arguments: list[str]) -> int:
         print(f"sparsestreet demo: {error}", file=sys.stderr)
         return 2
     started = time.perf_counter()
-    embedded = not any(text.lstrip("+").startswith("data=") for text in arguments)
+    logs = {text.partition("=")[2] for text in arguments if text.partition("=")[0].lstrip("+") == "data"}
+    small = () if logs - {"synthetic"} else SMALL
     for sparsify in SPARSIFY:
         print(f"\n== sparsify={sparsify} ==", flush=True)
         chosen = [f"sparsify={sparsify}", f"assignment={ASSIGNMENT}", f"schedule.max_steps={STEPS}", "overwrite=true"]
-        overrides = [*chosen, *(SMALL if embedded else ()), f"out={quoted(str(out / sparsify))}", *arguments]
+        overrides = [*chosen, *small, f"out={quoted(str(out / sparsify))}", *arguments]
         # A process each: what one training leaves in memory does not slow the next.
         status = subprocess.run([sys.executable, "-m", "sparsestreet", "train", *overrides], check=False).returncode
         if status < 0:
