@@ -25,6 +25,7 @@ from sparsestreet.metrics.lpips import Lpips, open_lpips
 from sparsestreet.metrics.reported import PerceptualDistance, Psnr, SetDistances, reported_metrics
 from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
+from sparsestreet.ops.settings import OWN_PRESETS
 from sparsestreet.phases import clock_of, stage
 from sparsestreet.records.summary import (
     NOVEL,
@@ -279,7 +280,7 @@ class ExtraMetrics:
             for line in _of_shifts(record):
                 say(line)
         if self.presets:
-            ways = {name: RenderOptions(SplatSettings.preset(name)) for name in self.presets}
+            ways = {name: RenderOptions(_drawing(name, options.settings)) for name in self.presets}
             with stage("presets"):
                 rendered = evaluate_presets(scene, views, ways, options, command=command)
                 PRESETS.write(out, rendered)
@@ -314,6 +315,11 @@ def _of_shifts(record: NovelRecord) -> Iterator[str]:
         yield f"{abs(shift.offset):g} m to the {side} (n={shift.views}): {what}"
     if record.absent:
         yield f"no distances: {record.absent}"
+
+
+def _drawing(preset: str, trained: SplatSettings) -> SplatSettings:
+    """Return the preset; antialias is a part of what was trained, and of no cut-offs."""
+    return replace(SplatSettings.preset(preset), antialias=trained.antialias and preset in OWN_PRESETS)
 
 
 def _of_presets(record: PresetRecord) -> Iterator[str]:

@@ -71,6 +71,11 @@ class SplatSettings:
         return _PRESETS[name]
 
 
+OWN_PRESETS = ("default", "exact", "fine", "fast")
+"""They choose cut-offs alone, so a scene is drawn with antialias or without as it was trained. The others are models of
+other renderers, none of which has it."""
+
+
 def _require(holds: bool, invariant: str, value: float | int | str) -> None:
     if not holds:
         raise ValueError(f"{invariant}, got {value!r}")

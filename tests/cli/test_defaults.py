@@ -31,7 +31,7 @@ def cfg():
 
 def streetgs() -> Recipe:
     """StreetGS in Python: parts by their names, and of their numbers those alone that have no default."""
-    control = DensityControl(Interval(0.04, 0.9, 100), 0.36, Interval(0.0, 0.0, 1000))
+    control = DensityControl(Interval(0.04, 0.9, 100), 0.6, Interval(0.0, 0.0, 1000))
     return Recipe(
         nodes={
             "background": BackgroundSettings(
@@ -114,6 +114,8 @@ DIFFERENT = {
     "MaskSparsity.weight",
     "SmplSettings.min_gaussians",
     "SmplSettings.sh_degree",
+    # Of the op: as in 3DGS. Of a training (``DEFAULT_OPTIONS``): true.
+    "SplatSettings.antialias",
     "VibratingDensity.split_scale",
     "VibratingSettings.max_gaussians",
     "VibratingSettings.min_gaussians",

@@ -157,9 +157,11 @@ def test_what_moves_is_one_choice_and_upstreams_presets_make_it(overrides, asked
 def test_settings_of_the_op_are_those_of_a_preset_unless_given():
     from sparsestreet.ops import SplatSettings
 
-    assert recipe_of(composed()).options.settings == SplatSettings()
+    assert recipe_of(composed()).options.settings == SplatSettings(antialias=True)
     changed = recipe_of(composed("render.preset=fine", "render.settings.alpha_min=0.1")).options
-    assert (changed.settings, changed.backend) == (SplatSettings(max_sigma=4.0, alpha_min=0.1), "auto")
+    assert (changed.settings, changed.backend) == (SplatSettings(max_sigma=4.0, alpha_min=0.1, antialias=True), "auto")
+    # Other renderers do not antialias.
+    assert recipe_of(composed("render.preset=inria")).options.settings == SplatSettings.preset("inria")
     # A record holds the values, whatever a preset means later.
     assert flat_config(resolved(composed("render.preset=fast")))["render.settings.alpha_min"] == pytest.approx(1 / 128)
     assert "no settings preset 'quick': choose one of ['default'" in there(

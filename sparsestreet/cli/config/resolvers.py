@@ -102,6 +102,13 @@ def of_preset(setting: str, *, _root_: DictConfig) -> Any:
     return getattr(SplatSettings.preset(_root_.render.preset), setting)
 
 
+def own_preset(*, _root_: DictConfig) -> bool:
+    """Return, for render.settings, whether ``render.preset`` is none of another renderer's."""
+    from sparsestreet.ops.settings import OWN_PRESETS  # torch, which a report needs not
+
+    return _root_.render.preset in OWN_PRESETS
+
+
 def gaussians_of(run: str | None, otherwise: Any, node: str | None = None) -> Any:
     """Of the controls: how many Gaussians a run ended with, by node or of one; without a run, what else is given.
 
@@ -199,6 +206,7 @@ _RESOLVERS = {
     "of_pressure": of_pressure,
     "at_scale": at_scale,
     "of_preset": of_preset,
+    "own_preset": own_preset,
     "gaussians_of": gaussians_of,
     "by_drive": by_drive,
     "by_scene": by_scene,

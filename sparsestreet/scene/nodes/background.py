@@ -49,6 +49,7 @@ class BackgroundSettings(NodeSettings):
 
     min_gaussians: int = 4000
     max_gaussians: int | None = 130_000
+    limit_rises: bool = True
     num_points: int = 40_000
     """Largest number of points of all sources together, but for those with a ``number``. The coverage of the training
     images sets each one's share."""

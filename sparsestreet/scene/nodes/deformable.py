@@ -251,6 +251,7 @@ class FieldSettings(BackgroundSettings):
     Raises ValueError for an impossible reach.
     """
 
+    limit_rises: bool = False
     network: NetworkSettings = field(default_factory=NetworkSettings)
     deform_from: float = 0.1
     """Fraction of the run from which rows are deformed; before, the rows take shape without a network."""

@@ -29,6 +29,7 @@ class VibratingSettings(BackgroundSettings):
     for impossible times or probabilities.
     """
 
+    limit_rises: bool = False
     frame_time: float = 0.02
     """The node's time from one frame to the next; cycle and life spans are in the node's time."""
     cycle: float = 0.2

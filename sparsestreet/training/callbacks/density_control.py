@@ -100,6 +100,8 @@ class DensityControl(Callback, RowListener):
         self._gradients: dict[str, dict[str, Tensor]] = {}
         """Node, watched column -> its gradient in the image that was differentiated last."""
         self.last_reset: int | None = None
+        self.first_counts: dict[str, int] = {}
+        """Node -> rows at the start of the training."""
 
     def setup(self, trainer: Trainer, pl_module: StreetSystem, stage: str) -> None:
         for name, node in pl_module.scene.nodes.items():
@@ -108,6 +110,7 @@ class DensityControl(Callback, RowListener):
                     len(node.rows), watched=strategy.watched, first_counts_all=self.first_counts_all
                 )
                 self.statistics.setdefault(name, empty)
+                self.first_counts.setdefault(name, len(node.rows))
 
     def on_train_start(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         # Only now are rows on their device, and statistics of a checkpoint restored.
@@ -213,9 +216,9 @@ class DensityControl(Callback, RowListener):
         node, statistics = system.scene.nodes[name], self.statistics[name]
         strategy = _strategy(node)
         when = {"radius": system.radius, "progress": course.progress(step)}
-        own = node.settings.densify_until
-        if step <= last_step(self.densify_until if own is None else own, course):
-            limit, drawn = node.settings.max_gaussians, self.generator.get_state()
+        until = self.densify_until if node.settings.densify_until is None else node.settings.densify_until
+        if step <= last_step(until, course):
+            limit, drawn = self._limit(name, node, course.progress(step) / until), self.generator.get_state()
             plan = strategy.densify(node.rows, statistics, max_gaussians=limit, generator=self.generator, **when)
             fits = self._fits(trainer, system, name, len(plan.source) - len(node.rows))
             if fits is not None:
@@ -230,6 +233,14 @@ class DensityControl(Callback, RowListener):
         if outside is not None and bool(outside.any()):
             resize_rows(trainer, system, name, RowPlan.keep(~outside), "outside its box")
         statistics.reset()
+
+    def _limit(self, name: str, node: Node, grown: float) -> int | None:
+        """Return how many rows a node may have once this share of its growth is over; None: any number."""
+        limit = node.settings.max_gaussians
+        if limit is None or not node.settings.limit_rises:
+            return limit
+        first = min(self.first_counts[name], limit)
+        return first + math.floor((limit - first) * min(grown, 1.0))
 
     def _fits(self, trainer: Trainer, system: StreetSystem, name: str, added: int) -> int | None:
         """Rows that a node may have where memory has no room for all that would be added; None where it has."""
@@ -268,6 +279,7 @@ class DensityControl(Callback, RowListener):
         """Several processes ask for it together."""
         own = {name: statistics.state_dict() for name, statistics in self.statistics.items()}
         state = {"statistics": own, "generator": self.generator.get_state(), "last_reset": self.last_reset}
+        state["first_counts"] = self.first_counts
         if self._ranks.size > 1:
             state["of_others"] = self._ranks.gathered(move_data_to_device(own, "cpu"))[1:]
         return state
@@ -279,7 +291,7 @@ class DensityControl(Callback, RowListener):
         )
         self.statistics = first
         self.generator.set_state(state_dict["generator"])
-        self.last_reset = state_dict["last_reset"]
+        self.last_reset, self.first_counts = state_dict["last_reset"], dict(state_dict["first_counts"])
 
 
 def _along_curve(plan: RowPlan, means: Tensor) -> RowPlan:

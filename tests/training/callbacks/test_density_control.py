@@ -33,6 +33,43 @@ def test_densify_until_its_fraction_and_cull_to_the_end_of_the_interval():
     assert [given["what"] for given in strategy.asked[:4]] == ["densify", "cull", "densify", "cull"]
 
 
+@pytest.mark.parametrize(
+    ("rises", "expected"),
+    [
+        # Of 81 rows that may come by step 50, those of each refinement by hand: 16.2, 32.4, 48.6, 64.8, 81.
+        (True, {"near": [36, 52, 68, 84, 101], "early": [60, 101], "full": [25] * 5, "free": [None] * 5}),
+        (False, {"near": [101] * 5, "early": [101] * 2, "full": [25] * 5, "free": [None] * 5}),
+    ],
+)
+def test_a_limit_rises_from_the_first_rows_to_its_full_height_where_a_node_stops_growing(rises, expected):
+    strategies = {name: AskedStrategy() for name in expected}
+    trainer, _, _ = started(
+        every_ten(densify_until=0.5),
+        near=background(20, density=strategies["near"], max_gaussians=101, limit_rises=rises),
+        early=background(20, density=strategies["early"], max_gaussians=101, limit_rises=rises, densify_until=0.2),
+        full=background(30, density=strategies["full"], max_gaussians=25, limit_rises=rises),
+        free=background(20, density=strategies["free"], max_gaussians=None, limit_rises=rises),
+    )
+    trainer.walk(100)
+    assert {name: limits(strategy) for name, strategy in strategies.items()} == expected
+
+
+def test_a_resumed_limit_rises_from_the_rows_at_the_start_of_the_training():
+    before, after = every_ten(densify_until=0.5), every_ten(densify_until=0.5)
+    started(before, near=background(20, density=AskedStrategy(), max_gaussians=101, limit_rises=True))[0].walk(20)
+    # The rows have grown meanwhile.
+    strategy = AskedStrategy()
+    trainer, _, _ = started(after, near=background(70, density=strategy, max_gaussians=101, limit_rises=True))
+    after.load_state_dict(before.state_dict() | {"statistics": after.state_dict()["statistics"]})
+    trainer.global_step = 20
+    trainer.walk(100)
+    assert limits(strategy) == [68, 84, 101]
+
+
+def limits(strategy: AskedStrategy) -> list[int | None]:
+    return [given["max_gaussians"] for given in strategy.asked if given["what"] == "densify"]
+
+
 def test_screen_gradients_are_gathered_while_rows_are_refined_and_no_longer():
     trainer, system, _ = started(every_ten(), background=background(density=AskedStrategy()))
     wanted = []
@@ -85,7 +122,7 @@ def test_a_pause_counts_images():
 
 def test_the_strategy_is_told_radius_cap_and_the_callbacks_generator():
     strategy, control = AskedStrategy(), every_ten()
-    node = background(density=strategy, max_gaussians=77)
+    node = background(density=strategy, max_gaussians=77, limit_rises=False)
     trainer, system, _ = started(control, background=node)
     trainer.walk(10)
     densify, cull = strategy.asked
