@@ -1,5 +1,6 @@
 """Over which views a run is measured beyond its quality."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -90,6 +91,20 @@ def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
 def test_nothing_is_measured_where_nothing_is_asked(tmp_path):
     ExtraMetrics().measure(small_scene(), street(), OPTIONS, out=tmp_path, command="c", say=pytest.fail)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_a_scene_is_drawn_with_antialias_as_it_was_trained_by_others_without(antialias, tmp_path, monkeypatch):
+    asked = []
+    record = PresetRecord(command="p", device="d", threads=1, views=2, noise=NOISE, rendered=())
+    monkeypatch.setattr(extra, "evaluate_presets", lambda scene, views, ways, *_, **__: asked.append(ways) or record)
+    options = RenderOptions(SplatSettings(antialias=antialias), "reference")
+    told = ExtraMetrics(presets=("default", "exact", "fine", "fast", "inria", "gsplat15", "drivestudio"))
+    told.measure(small_scene(), street(), options, out=tmp_path, command="c", say=pytest.fail)
+    drawn = {name: way.settings.antialias for name, way in asked[0].items()}
+    own = dict.fromkeys(("default", "exact", "fine", "fast"), antialias)
+    assert drawn == own | dict.fromkeys(("inria", "gsplat15", "drivestudio"), False)
+    assert all(replace(way.settings, antialias=False) == SplatSettings.preset(name) for name, way in asked[0].items())
 
 
 def test_what_is_said_of_presets():

@@ -161,8 +161,8 @@ class NodeSettings(ABC):
     max_gaussians: int | None = None
     """Density control stops here; None: no limit."""
     limit_rises: bool = False
-    """Whether ``max_gaussians`` holds where growth ends only, and before it a limit that rises evenly with the steps from
-    the rows at the start. Steps cost less while there are few; what is split late is split where detail is missing."""
+    """Whether ``max_gaussians`` holds where growth ends only, and before it a limit that rises evenly with the steps
+    from the rows at the start. Steps cost less while there are few; what splits late splits where detail is missing."""
     sh_degree: int = 3
     mask: MaskSettings | None = None
     """None: the node has no mask."""
