@@ -12,13 +12,17 @@ import torch
 from jaxtyping import Float64, UInt8
 
 from sparsestreet.atomic import atomic_folder
+from sparsestreet.data.lazy import spread
 from sparsestreet.export.frame import selected, turned
+from sparsestreet.export.plain import plain_factors, spread_cameras
 from sparsestreet.export.ply import scene_gaussians, write_ply
 from sparsestreet.geometry.cameras import project
 from sparsestreet.scene.nodes import Tracked
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
 
+_LOOKS = 12
+"""Instants at which an object is looked at for ``plain_factors``."""
 _MARGIN = 0.25
 """Share of a box's picture that is shown around it, on each side."""
 
@@ -123,11 +127,12 @@ def write_objects(folder: Path, stored: StoredScene, views: Sequence[View]) -> l
 
     An object that no recorded instant shows is left out.
 
-    A .ply has x ahead, y left, z up from the middle of the object's box, meters; of a body, as it stands in the middle
-    of its time. Poses are those of the recorded instants at which the object is there. The whole folder is written, or
-    nothing. Raises ValueError for a scene without objects, OSError where the folder is there and not empty.
+    A .ply is for viewers that do not antialias (``plain_factors``), and has x ahead, y left, z up from the middle
+    of the object's box, meters; of a body, as it stands in the middle of its time. Poses are those of the recorded
+    instants at which the object is there. The whole folder is written, or nothing. Raises ValueError for a scene
+    without objects, OSError where the folder is there and not empty.
     """
-    instants, antialiased = _instants(views), stored.options.settings.antialias
+    instants, settings = _instants(views), stored.options.settings
     objects = []
     with atomic_folder(folder) as temporary:
         for name, node in stored.scene.nodes.items():
@@ -139,7 +144,8 @@ def write_objects(folder: Path, stored: StoredScene, views: Sequence[View]) -> l
         still = [name for name, node in stored.scene.nodes.items() if not isinstance(node, Tracked)]
         if still:
             found = scene_gaussians(stored, instants[0].time, nodes=still)
-            write_ply(temporary / "still.ply", found, antialiased=antialiased)
+            factors = plain_factors([(found, spread_cameras(views))], settings)
+            write_ply(temporary / "still.ply", replace(found, opacities=found.opacities * factors))
         described = {
             "axes": "x ahead, y left, z up; meters; quaternions wxyz",
             "still": "still.ply" if still else None,
@@ -167,12 +173,15 @@ def _object(
     rows = (node.rows.instances == number) & (found.opacities > 0)
     if not bool(rows.any()):
         return []
-    own = selected(found, rows)
+    looks = [there[place][0] for place in spread(len(there), _LOOKS)]
+    seen = [(scene_gaussians(stored, look.time, nodes=[node_name]), [look.camera]) for look in looks]
+    factors = plain_factors(seen, stored.options.settings)
+    own = selected(replace(found, opacities=found.opacities * factors), rows)
     turn = torch.from_numpy(world_from_object[:3, :3]).to(own.means)
     shift = torch.from_numpy(world_from_object[:3, 3]).to(own.means)
     file = f"{place:03d}.ply"
     moved = turned(replace(own, means=own.means - shift), turn.T)
-    count = write_ply(folder / file, moved, antialiased=stored.options.settings.antialias)
+    count = write_ply(folder / file, moved)
     return [
         {
             "name": node.names[number],

@@ -1,7 +1,7 @@
 """A street as clouds that viewers can play: what stands still, each object in its own frame, and its poses over time.
 
-Viewers of clouds know one color for a Gaussian, no lens, no shutter and no mask. A cloud's colors are the mean of those
-that the log's cameras see, those that see it nearest counting most (by the area that it fills).
+Viewers of clouds know one color for a Gaussian, no antialias, no lens, no shutter and no mask. A cloud's colors are the
+mean of those that the log's cameras see, those that see it nearest counting most (by the area that it fills).
 """
 
 from collections.abc import Iterator, Sequence
@@ -13,10 +13,12 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from sparsestreet.export.path import CameraPath, Rig
+from sparsestreet.export.plain import plain_factors
 from sparsestreet.export.ply import check_gaussians
 from sparsestreet.finite import check_finite
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import project
+from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import Placement, RawGaussians
 from sparsestreet.ops.spherical_harmonics import view_colors
@@ -75,12 +77,11 @@ def recorded_parts(stored: StoredScene, path: CameraPath, every: int) -> list[Pa
     Raises ValueError for a scene with a number that is NaN, infinite, or becomes so.
     """
     check_numbers(stored.scene)
-    smallest = stored.options.settings.alpha_min
-    nodes = stored.scene.nodes.items()
-    return [part for name, node in nodes for part in _parts(name, node, path, every, smallest)]
+    nodes, settings = stored.scene.nodes.items(), stored.options.settings
+    return [part for name, node in nodes for part in _parts(name, node, path, every, settings)]
 
 
-def _parts(name: str, node: Node, path: CameraPath, every: int, smallest: float) -> Iterator[Part]:
+def _parts(name: str, node: Node, path: CameraPath, every: int, settings: SplatSettings) -> Iterator[Part]:
     first, instances = _raw(node, path[0]), node.instances()
     # All raw rows of a long drive do not fit in memory.
     places, same = zip(
@@ -88,17 +89,17 @@ def _parts(name: str, node: Node, path: CameraPath, every: int, smallest: float)
     )
     if all(same):
         looks = np.unique(np.linspace(0, len(path) - 1, LOOKS).round().astype(int)).tolist()
-        wholes = [_whole(name, first, [(_raw(node, path[look]), path[look]) for look in looks])]
+        wholes = [_whole(name, first, [(_raw(node, path[look]), path[look]) for look in looks], settings)]
     else:
         # A shape is that of an instant in the middle of those that show it.
         keys = [min(start + every // 2, len(path) - 1) for start in range(0, len(path), every)]
         raws = ((_raw(node, path[key]), path[key]) for key in keys)
-        wholes = [_whole(name, raw, [(raw, rig)]) for raw, rig in raws]
+        wholes = [_whole(name, raw, [(raw, rig)], settings) for raw, rig in raws]
     shape_at = [0 if all(same) else index // every for index in range(len(path))]
     # A slash would make a folder of a viewer's list.
     objects = [name] if instances is None else [f"{name}/{one.replace('/', '_')}" for one in instances.names]
     for number, part_name in enumerate(objects):
-        part = _part(part_name, number, places, wholes, shape_at, smallest)
+        part = _part(part_name, number, places, wholes, shape_at, settings.alpha_min)
         if part.shapes:
             yield part
 
@@ -111,9 +112,11 @@ class _Whole:
     colors: Float[Tensor, "n 3"]
 
 
-def _whole(name: str, raw: RawGaussians, looks: Sequence[tuple[RawGaussians, Rig]]) -> _Whole:
+def _whole(name: str, raw: RawGaussians, looks: Sequence[tuple[RawGaussians, Rig]], settings: SplatSettings) -> _Whole:
     own = activate([replace(raw, placement=None)], sh_degree=FINISHED.sh_degree)
     check_gaussians(own, f" of node {name}")
+    placed = ((activate([look], sh_degree=0), [view.camera for view in rig]) for look, rig in looks)
+    own = replace(own, opacities=own.opacities * plain_factors(placed, settings))
     return _Whole(own, _seen_colors(looks))
 
 

@@ -65,15 +65,26 @@ def test_what_a_file_loses_is_said(tmp_path, name, mip, capsys):
     moment = [] if name in ("objects", "a.html") else ["time=0.6"]
     assert export([str(tmp_path), str(tmp_path / name), *moment]) == 0
     said = capsys.readouterr().out
-    blurs = "trained with antialias: plain viewers show small Gaussians brighter"
-    assert (blurs in said) == (mip and name != "a.spz")
+    assert ("trained with antialias: opacities are those that its cameras see" in said) == (mip and name != "a.spz")
     assert "effects of the cameras (lens)" in said
     assert ("left out: 3 Gaussians" in said) == bool(moment)
     files = [tmp_path / name] if moment else sorted((tmp_path / name).glob("*.ply")) if name == "objects" else []
     for file in files:
         if file.suffix == ".ply":
-            assert (b"\ncomment SplatRenderMode: mip\n" in file.read_bytes().partition(b"end_header")[0]) == mip
+            assert b"SplatRenderMode" not in file.read_bytes().partition(b"end_header")[0]
             assert len(PlyData.read(file)["vertex"]) > 0
+
+
+@pytest.mark.parametrize(("known", "asked"), [(True, "antialias=true"), (False, "nodes=[background]")])
+def test_a_ply_says_that_it_wants_antialias_where_that_is_asked_or_no_camera_is_known(tmp_path, known, asked, capsys):
+    stored = stored_street()
+    options = replace(stored.options, settings=replace(stored.options.settings, antialias=True))
+    save_scene(tmp_path / "scene.safetensors", replace(stored, options=options))
+    if known:
+        write_views(tmp_path / "views.json", street_views(), [], frame_rate=10.0)
+    assert export([str(tmp_path), str(tmp_path / "a.ply"), asked]) == 0
+    assert ("no camera is known" in capsys.readouterr().out) != known
+    assert b"\ncomment SplatRenderMode: mip\n" in (tmp_path / "a.ply").read_bytes()
 
 
 FORMATS = ["a.ply", "a.spz", "a.html", "objects", "a.usdz", "a.street"]

@@ -94,6 +94,16 @@ def test_a_cloud_has_the_color_that_the_cameras_see_on_average_those_nearer_more
     np.testing.assert_allclose(cloud.colors, total / weight, atol=1e-5)
 
 
+def test_clouds_of_a_scene_with_antialias_are_fainter_where_cameras_see_less_of_their_light():
+    stored = stored_street()
+    mip = replace(stored, options=replace(stored.options, settings=replace(stored.options.settings, antialias=True)))
+    trained, plain = parts_of(stored), parts_of(mip)
+    for name, part in plain.items():
+        for shape, other in zip(part.shapes, trained[name].shapes, strict=True):
+            assert (shape.opacities <= other.opacities).all()
+            assert (shape.opacities < 0.999 * other.opacities).any()
+
+
 def test_edits_are_honored():
     stored = stored_street()
     before = parts_of(stored)

@@ -8,6 +8,7 @@ from sparsestreet.cli.commands.options import run_command
 from sparsestreet.naming import one_line
 
 if TYPE_CHECKING:
+    from sparsestreet.ops import SplatSettings
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.scene.views import RecordedViews
     from sparsestreet.types import Gaussians
@@ -40,6 +41,8 @@ of a .ply or .spz:
   nodes      [background,rigid]: only these nodes of the scene
   instance   only this object, by the name of its track; a name that does not exist lists those that do
   sky        true: the sky as 12,000 discs far away; not of a .ply (default: true)
+  antialias  true: opacities as trained, for viewers that go by SplatRenderMode: mip (gsplat, Brush); of a .ply
+             (default: those that suit viewers of plain 3DGS)
   check      true: read the file again, by splat-transform where it is installed, and say what it lost
 
 of an .html:
@@ -52,12 +55,13 @@ of a .usdz:
 """
 
 DEFAULT_SHAPES = 4.0
-ANTIALIAS_LOST = "trained with antialias: plain viewers show small Gaussians brighter"
+ANTIALIAS_LOST = "trained with antialias, and no camera is known: plain viewers show small Gaussians brighter"
+ANTIALIAS_MEAN = "trained with antialias: opacities are those that its cameras see on average, for plain viewers"
 
 _FRAME = ("time", "nodes", "instance")
 _OWN = {
     ".street": (),
-    ".ply": _FRAME,
+    ".ply": (*_FRAME, "antialias"),
     ".spz": (*_FRAME, "sky", "check"),
     ".html": ("shapes",),
     "": (),
@@ -83,6 +87,7 @@ class ExportRequest:
     names: tuple[str, ...] | None = None
     sky: bool | None = None
     check: bool | None = None
+    antialias: bool | None = None
     parts: tuple[str, ...] = ()
 
     @property
@@ -134,7 +139,7 @@ def _export_frame(request: ExportRequest, stored: "StoredScene") -> None:
     from sparsestreet.export.ply import scene_gaussians, write_ply
     from sparsestreet.export.spz import spz_notes, write_spz
 
-    time, mip, plain = request.time or 0.0, stored.options.settings.antialias, request.kind == ".ply"
+    time, plain = request.time or 0.0, request.kind == ".ply"
     chosen = {"nodes": request.nodes, "instances": None if request.instance is None else [request.instance]}
     gaussians = scene_gaussians(stored, time, **chosen)
     if plain:
@@ -142,13 +147,16 @@ def _export_frame(request: ExportRequest, stored: "StoredScene") -> None:
     else:
         left_out, why = int((gaussians.opacities < UNSEEN).sum()), "have an opacity below 1 / 255"
         gaussians = frame_gaussians(stored, time, **chosen, sky=request.sky is not False)
-    count = (write_ply if plain else write_spz)(request.out, gaussians, antialiased=mip)
+    settings, said = stored.options.settings, None
+    if plain and settings.antialias and not request.antialias:
+        gaussians, settings, said = _for_plain_viewers(request, gaussians, settings)
+    count = (write_ply if plain else write_spz)(request.out, gaussians, antialiased=settings.antialias)
     size = request.out.stat().st_size
     print(f"{request.out}: {count:,} Gaussians at time {time:g}, {size / 1e6:.2f} MB, {size / count:.1f} bytes each")
     if left_out:
         print(f"left out: {left_out:,} Gaussians that {why} at this time")
-    if mip and plain:
-        print(ANTIALIAS_LOST)
+    if said:
+        print(said)
     for note in [] if plain else spz_notes(gaussians):
         print(note)
     has_sky = not plain and request.sky is not False and request.nodes is None and request.instance is None
@@ -156,6 +164,24 @@ def _export_frame(request: ExportRequest, stored: "StoredScene") -> None:
     print(f"lost: {'; '.join([f'time, as this is the moment {time:g}', sky, *_lost_of_scene(stored)])}")
     if request.check:
         _check(request, stored, gaussians)
+
+
+def _for_plain_viewers(
+    request: ExportRequest, gaussians: "Gaussians", settings: "SplatSettings"
+) -> "tuple[Gaussians, SplatSettings, str]":
+    """Return Gaussians and settings of viewers that do not antialias, and what is said of it; both as they are where no
+    camera is known."""
+    from dataclasses import replace
+
+    from sparsestreet.cli.commands.scenes import recorded_views
+    from sparsestreet.export.plain import plain_factors, spread_cameras
+
+    try:
+        cameras = spread_cameras(recorded_views(request.scene, request.views).all)
+    except FileNotFoundError:
+        return gaussians, settings, ANTIALIAS_LOST
+    own = replace(gaussians, opacities=gaussians.opacities * plain_factors([(gaussians, cameras)], settings))
+    return own, replace(settings, antialias=False), ANTIALIAS_MEAN
 
 
 def _check(request: ExportRequest, stored: "StoredScene", gaussians: "Gaussians") -> None:
@@ -223,7 +249,7 @@ def _export_objects(request: ExportRequest, stored: "StoredScene", views: "Recor
     if absent:
         print(f"left out, as no recorded frame shows them: {', '.join(map(one_line, absent))}")
     if stored.options.settings.antialias:
-        print(ANTIALIAS_LOST)
+        print(ANTIALIAS_MEAN)
     print(f"lost: {'; '.join(['the sky', 'how shapes change', *_lost_of_scene(stored)])}")
 
 
@@ -248,5 +274,5 @@ def _export_page(request: ExportRequest, stored: "StoredScene", views: "Recorded
         f"{request.out.stat().st_size / 1e6:.1f} MB; open it in a browser"
     )
     if stored.options.settings.antialias:
-        print(ANTIALIAS_LOST)
+        print(ANTIALIAS_MEAN)
     print(f"lost: {'; '.join(['colors that change with the direction', *_lost_of_scene(stored)])}")
