@@ -55,7 +55,7 @@ def find_objects(
     seconds = instant_seconds(groups)
     ground = find_ground(scan.points for group in groups for scan in group)
     drive = _look(groups, ground, settings, report)
-    clusters = [find_clusters(instant.returns.where(instant.moving), settings) for instant in drive]
+    clusters = [find_clusters(instant.returns.where(instant.moving), ground, settings) for instant in drive]
     chains = [chain for chain in associate(clusters, seconds, settings) if _moves(chain)]
     fitted = partial(fit, seconds=seconds, ground=ground, refine=False)
     objects = []
