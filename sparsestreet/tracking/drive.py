@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from sparsestreet.tracking.association import Chain
 from sparsestreet.tracking.clusters import MAX_RETURNS
-from sparsestreet.tracking.fit import Fit
+from sparsestreet.tracking.fit import Box, Fit
 from sparsestreet.tracking.free_space import count_views, packed
 from sparsestreet.tracking.ground import Ground
 from sparsestreet.tracking.path import in_frame
@@ -37,14 +37,13 @@ class Instant:
     standing: Bool[np.ndarray, " n"]
     """Their places are always occupied."""
 
-    def inside(
-        self, middle: Float64[np.ndarray, "2"], yaw: float, size: Float64[np.ndarray, "3"], margin: float
-    ) -> Int64[np.ndarray, " k"]:
-        """Return the rows of the returns in a box in plan, with a margin, meters."""
-        reach = float(np.hypot(*size[:2])) / 2 + margin
-        near = np.flatnonzero((np.abs(self.returns.points[:, :2] - middle) < reach).all(1))
-        local = in_frame(self.returns.points[near], middle, yaw)
-        return near[(np.abs(local) < size[:2] / 2 + margin).all(1)]
+    def inside(self, box: Box, margin: float) -> Int64[np.ndarray, " k"]:
+        """Return the rows of the returns in a box, with a margin around and above it, meters."""
+        points, half = self.returns.points, box.size[:2] / 2
+        reach = float(np.hypot(*half)) + margin
+        near = np.flatnonzero((np.abs(points[:, :2] - box.middle) < reach).all(1))
+        within = (np.abs(in_frame(points[near], box.middle, box.yaw)) < half + margin).all(1)
+        return near[within & (points[near, 2] < box.bottom + box.size[2] + margin)]
 
 
 def look(
@@ -82,7 +81,7 @@ def gathered(found: Fit, drive: Sequence[Instant]) -> Chain:
     steps, parts = [], []
     for step in found.steps.tolist():
         instant = drive[step]
-        rows = instant.inside(*found.at(step), found.shape.size, MARGIN)
+        rows = instant.inside(found.at(step), MARGIN)
         rows = rows[~instant.standing[rows]]
         if len(rows) >= MIN_GATHERED:
             steps.append(step)
@@ -98,7 +97,7 @@ def moving_share(found: Fit, drive: Sequence[Instant], speed: float) -> float:
     """Return the share of the returns in its boxes that move, at steps at which the object is at least this fast."""
     inside = moving = 0
     for step in found.steps[found.speed >= speed].tolist():
-        rows = drive[step].inside(*found.at(step), found.shape.size, COUNT_MARGIN)
+        rows = drive[step].inside(found.at(step), COUNT_MARGIN)
         inside += len(rows)
         moving += int(drive[step].moving[rows].sum())
     return moving / max(inside, 1)

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from sparsestreet.tracking.association import Chain
 from sparsestreet.tracking.clusters import MAX_RETURNS
 from sparsestreet.tracking.drive import MARGIN, MIN_GATHERED, Instant
-from sparsestreet.tracking.fit import Fit
+from sparsestreet.tracking.fit import Box, Fit
 from sparsestreet.tracking.path import HEADING_REACH
 from sparsestreet.tracking.scans import Returns
 from sparsestreet.tracking.settings import TrackingSettings
@@ -39,14 +39,15 @@ def _followed(
     found: Fit, drive: Sequence[Instant], seconds: Float64[np.ndarray, " t"], settings: TrackingSettings, way: int
 ) -> dict[int, Returns]:
     row = -1 if way > 0 else 0
-    step, place, yaw = int(found.steps[row]), found.path[row], float(found.yaw[row])
+    step = int(found.steps[row])
+    place, yaw = found.path[row], float(found.yaw[row])
     velocity = _end_velocity(found, seconds, row)
     parts: dict[int, Returns] = {}
     last = seconds[step]
     while 0 <= step + way < len(drive) and abs(seconds[step + way] - last) <= settings.max_lost:
         passed = seconds[step + way] - seconds[step]
         step, place = step + way, place + velocity * passed
-        seen = _seen(drive[step], place, yaw, found)
+        seen = _seen(drive[step], Box(place, yaw, float(found.bottom[row]), found.shape.size))
         if len(seen) < MIN_GATHERED:
             continue
         surprise = _surprise(seen, found, place, yaw)
@@ -72,8 +73,8 @@ def _end_velocity(found: Fit, seconds: Float64[np.ndarray, " t"], row: int) -> F
     return (found.path[row] - found.path[other]) / passed if passed else np.zeros(2)
 
 
-def _seen(instant: Instant, place: Float64[np.ndarray, "2"], yaw: float, found: Fit) -> Returns:
-    rows = instant.inside(place, yaw, found.shape.size, MARGIN)
+def _seen(instant: Instant, box: Box) -> Returns:
+    rows = instant.inside(box, MARGIN)
     return instant.returns.where(rows[instant.vacated[rows]]).thinned(MAX_RETURNS)
 
 

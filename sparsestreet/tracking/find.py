@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float64
 
-from sparsestreet.tracking.association import YOUNG, Chain, associate
+from sparsestreet.tracking.association import Chain, associate
 from sparsestreet.tracking.clusters import find_clusters
 from sparsestreet.tracking.drive import Instant, gathered, look, moving_share
 from sparsestreet.tracking.extension import extended
@@ -44,26 +44,16 @@ def find_objects(
     fitted = partial(fit, seconds=seconds, ground=ground, refine=False)
     objects = []
     for chain in join_chains(chains, fitted, seconds, settings):
-        whole = _completed(fitted(chain), fitted, drive, seconds, settings)
-        if len(whole) >= settings.min_frames:
+        within = gathered(fitted(chain), drive)
+        if len(within) < settings.min_frames:
+            continue
+        core = fitted(within)
+        if _is_object(core, drive, seconds, settings):
+            whole = Chain.merged((within, extended(core, drive, seconds, settings)))
             objects.append(fit(whole, seconds, ground, refine=True))
     objects = [one for one in objects if _is_object(one, drive, seconds, settings)]
     frames = np.array([group[0].frame for group in groups], np.int64)
     return tuple(_found(one, frames) for one in _apart(objects))
-
-
-def _completed(
-    found: Fit,
-    fitted: Callable[[Chain], Fit],
-    drive: Sequence[Instant],
-    seconds: Float64[np.ndarray, " t"],
-    settings: TrackingSettings,
-) -> Chain:
-    """All returns of an object, between its first and last cluster and beyond."""
-    within = gathered(found, drive)
-    if len(within) < YOUNG:
-        return within
-    return Chain.merged((within, extended(fitted(within), drive, seconds, settings)))
 
 
 def _moves(chain: Chain) -> bool:
@@ -74,6 +64,8 @@ def _moves(chain: Chain) -> bool:
 
 MAX_ERROR = 0.5
 """Meters, of the median distance between single instants and the path."""
+MAX_PERSON = 2.4
+"""Meters: people and cyclists are no higher, but leaves are."""
 MIN_STRAIGHT, MIN_SEEN = 0.5, 0.4
 """Least share of its path by which an object gets away from its first place, and of its steps at which it is seen."""
 
@@ -90,6 +82,8 @@ def _is_object(
     mean_speed = walked / (seconds[found.steps[-1]] - seconds[found.steps[0]])
     goes = moved > least and moved > MIN_STRAIGHT * walked and mean_speed < settings.max_speed
     clear = found.error < MAX_ERROR and (found.counts > 0).mean() > MIN_SEEN
+    if found.shape.kind != "vehicle" and found.shape.size[2] > MAX_PERSON:
+        return False
     return bool(goes and clear and moving_share(found, drive, MIN_SPEED) > settings.min_moving_share)
 
 
@@ -111,7 +105,8 @@ def _within(one: Fit, other: Fit) -> bool:
     both = np.intersect1d(one.steps, other.steps).tolist()
     if len(both) < MIN_COMMON * len(one.steps):
         return False
-    local = np.array([in_frame(one.at(step)[0][None], *other.at(step))[0] for step in both])
+    boxes = [(one.at(step), other.at(step)) for step in both]
+    local = np.array([in_frame(mine.middle[None], box.middle, box.yaw)[0] for mine, box in boxes])
     return bool((np.abs(local) < other.shape.size[:2] / 2).all(1).mean() > MAX_INSIDE)
 
 
