@@ -48,10 +48,10 @@ def find_objects(
         if len(within) < settings.min_frames:
             continue
         core = fitted(within)
-        if _is_object(core, drive, seconds, settings):
+        if _is_object(core, drive, seconds, settings, settings.min_moved):
             whole = Chain.merged((within, extended(core, drive, seconds, settings)))
             objects.append(fit(whole, seconds, ground, refine=True))
-    objects = [one for one in objects if _is_object(one, drive, seconds, settings)]
+    objects = [one for one in objects if _is_object(one, drive, seconds, settings, _least_way(one, settings))]
     frames = np.array([group[0].frame for group in groups], np.int64)
     return tuple(_found(one, frames) for one in _apart(objects))
 
@@ -64,21 +64,31 @@ def _moves(chain: Chain) -> bool:
 
 MAX_ERROR = 0.5
 """Meters, of the median distance between single instants and the path."""
+MANY_RETURNS = 10
+"""Returns a step; an object with fewer must get farther."""
 MAX_PERSON = 2.4
 """Meters: people and cyclists are no higher, but leaves are."""
 MIN_STRAIGHT, MIN_SEEN = 0.5, 0.4
 """Least share of its path by which an object gets away from its first place, and of its steps at which it is seen."""
 
 
+def _least_way(found: Fit, settings: TrackingSettings) -> float:
+    """How far an object must get, meters: what has few returns goes some way by noise alone."""
+    return settings.min_moved if np.median(found.counts) >= MANY_RETURNS else settings.min_moved_few
+
+
 def _is_object(
-    found: Fit, drive: Sequence[Instant], seconds: Float64[np.ndarray, " t"], settings: TrackingSettings
+    found: Fit,
+    drive: Sequence[Instant],
+    seconds: Float64[np.ndarray, " t"],
+    settings: TrackingSettings,
+    least: float,
 ) -> bool:
-    """Whether it goes somewhere, as leaves and the edges of what stands do not."""
+    """Whether it goes somewhere, as leaves and the edges of what stands do not; ``least`` meters at least."""
     going = found.speed >= MIN_SPEED
     steps = np.linalg.norm(np.diff(found.path, axis=0), axis=1)
     walked = steps[going[1:] | going[:-1]].sum()
     moved = np.linalg.norm(found.path[-1] - found.path[0])
-    least = settings.min_moved if np.median(found.counts) >= 10 else settings.min_moved_few
     mean_speed = walked / (seconds[found.steps[-1]] - seconds[found.steps[0]])
     goes = moved > least and moved > MIN_STRAIGHT * walked and mean_speed < settings.max_speed
     clear = found.error < MAX_ERROR and (found.counts > 0).mean() > MIN_SEEN
