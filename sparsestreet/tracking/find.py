@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from sparsestreet.tracking.association import Chain, associate
 from sparsestreet.tracking.clusters import find_clusters
@@ -53,7 +53,7 @@ def find_objects(
             objects.append(fit(whole, seconds, ground, refine=True))
     objects = [one for one in objects if _is_object(one, drive, seconds, settings, _least_way(one, settings))]
     frames = np.array([group[0].frame for group in groups], np.int64)
-    return tuple(_found(one, frames) for one in _apart(objects))
+    return tuple(_found(one, frames, _confidence(one, drive)) for one in _apart(objects))
 
 
 def _moves(chain: Chain) -> bool:
@@ -120,15 +120,16 @@ def _within(one: Fit, other: Fit) -> bool:
     return bool((np.abs(local) < other.shape.size[:2] / 2).all(1).mean() > MAX_INSIDE)
 
 
-def _found(one: Fit, frames: np.ndarray) -> FoundObject:
+def _confidence(found: Fit, drive: Sequence[Instant]) -> float:
+    """Product of the share of its steps at which it is seen, of the share of its returns that move, and of
+    n / (n + 2) with the median number n of returns of a step."""
+    seen = found.counts[found.counts > 0]
+    few = np.median(seen) / (np.median(seen) + 2)
+    return float(len(seen) / len(found.counts) * moving_share(found, drive, MIN_SPEED) * few)
+
+
+def _found(one: Fit, frames: Int64[np.ndarray, " t"], confidence: float) -> FoundObject:
     middle = np.column_stack((one.path, one.bottom + one.shape.size[2] / 2))
-    seen = float((one.counts > 0).mean())
-    return FoundObject(
-        kind=one.shape.kind,
-        frames=frames[one.steps],
-        world_from_object=upright_poses(middle, one.yaw),
-        size=one.shape.size,
-        size_unsure=one.shape.unsure,
-        returns=one.counts,
-        confidence=seen,
-    )
+    poses = upright_poses(middle, one.yaw)
+    shape = one.shape
+    return FoundObject(shape.kind, frames[one.steps], poses, shape.size, shape.unsure, one.counts, confidence)
