@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sparsestreet.tracking.association import Chain
 from sparsestreet.tracking.ground import Ground
@@ -133,7 +133,7 @@ def laid_on_each_other(
             others = model[(owner != number) & (np.abs(owner - number) <= REGISTRATION_REACH)]
             if min(len(mine), len(others)) < MIN_COMPARED:
                 continue
-            gaps, nearest = cKDTree(others).query(mine, distance_upper_bound=MAX_GAP)
+            gaps, nearest = map(np.asarray, KDTree(others).query(mine, distance_upper_bound=MAX_GAP))
             close = np.isfinite(gaps)
             if close.mean() >= 0.5:
                 mean = (others[nearest[close], :2] - mine[close, :2]).mean(0)
