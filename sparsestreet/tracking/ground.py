@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy import ndimage
 
 CELL = 0.5
@@ -14,6 +14,9 @@ LOW_QUANTILE = 0.2
 of all scans counts, but this quantile."""
 STANDING_SPAN, STANDING_STEP = 11, 0.5
 """Cells across, and meters: what rises more above the lowest cell around it is no road, but something that stands."""
+
+LOW_PERCENTILE = 25
+"""Percentile of the cells around a cell, below which by the same step it is no road either."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +78,17 @@ def _plane(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
 
 
 def _without_what_stands(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
-    """Heights of all cells, those of walls, cars and cells without a return from the nearest of the road."""
+    """Heights of all cells, those of walls, cars and cells without a return from the nearest of the road.
+
+    A cell far below those around it, as a mirror in a wet road makes, would make these look as if they stood.
+    """
+    around = ndimage.percentile_filter(_filled(heights, np.isfinite(heights)), LOW_PERCENTILE, size=5)
+    heights = np.where(heights > around - STANDING_STEP, heights, np.nan)  # False for NaN
     lowest = ndimage.minimum_filter(np.where(np.isnan(heights), np.inf, heights), size=STANDING_SPAN)
-    road = heights < lowest + STANDING_STEP  # False for NaN
-    nearest = np.asarray(ndimage.distance_transform_edt(~road, return_distances=False, return_indices=True))
-    return ndimage.median_filter(heights[tuple(nearest)], size=5)
+    return ndimage.median_filter(_filled(heights, heights < lowest + STANDING_STEP), size=5)
+
+
+def _filled(heights: Float64[np.ndarray, "x y"], known: Bool[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
+    """Heights with those of the nearest known cell where it is not known."""
+    nearest = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
+    return heights[tuple(nearest)]

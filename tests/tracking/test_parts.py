@@ -147,7 +147,7 @@ def test_paths_solve_the_dense_equations(count):
 
 def test_a_path_of_constant_velocity_stays_as_it_is_across_gaps():
     seconds = np.array([0.0, 0.1, 0.2, 0.7, 0.8, 1.3])
-    line = np.outer(seconds, (3.0, -2.0)) + (5, 7)
+    line = np.outer(seconds, (3.0, -2.0)) + np.array((5, 7))
     steps = np.array([0, 1, 3, 5])
     # What holds unmeasured steps back is 1e-9 of the rest.
     assert smooth(steps, line[steps], np.ones(4), seconds, 60.0) == pytest.approx(line, abs=1e-5)
@@ -254,7 +254,7 @@ def test_lengths_nobody_saw_are_usual_ones_and_say_so():
 
 def test_outlines_are_those_of_the_frame():
     corners = np.array([[2.0, 1.0], [-2, 1], [-2, -1], [2, -1]])
-    points = turned(corners, np.full(4, 0.7)) + (30, -4)
+    points = turned(corners, np.full(4, 0.7)) + np.array((30, -4))
     found = outlines([returns_of(np.column_stack((points, np.zeros(4))))], np.array([[30.0, -4.0]]), np.array([0.7]))
     # The 1 % quantile of four values lies 3 % of a gap inside.
     assert found == pytest.approx(np.array([[[-2, -1], [2, 1]]]), abs=0.13)
@@ -262,20 +262,17 @@ def test_outlines_are_those_of_the_frame():
 
 def test_returns_are_laid_upon_each_other():
     random = np.random.default_rng(7)
-    sides = np.column_stack(
-        (random.uniform(-2, 2, 80), np.where(random.random(80) < 0.5, -0.9, 0.9), random.random(80))
-    )
-    sides[:30, 0], sides[:30, 1] = 2.0, random.uniform(-0.9, 0.9, 30)
     path = np.column_stack((np.arange(8) * 1.0, np.arange(8) * 0.5))
     yaw = np.full(8, np.arctan(0.5))
     wrong = random.normal(0, 0.08, (8, 2))
-    parts = [
-        returns_of(np.column_stack((turned(sides[:, :2], np.full(80, angle)) + place, sides[:, 2])))
-        for place, angle in zip(path, yaw, strict=True)
-    ]
+    parts = []
+    for place, angle in zip(path, yaw, strict=True):
+        sides = np.column_stack((random.uniform(-2, 2, 80), np.full(80, 0.9)))
+        sides[:40] = np.column_stack((np.full(40, 2.0), random.uniform(-0.9, 0.9, 40)))
+        parts.append(returns_of(np.column_stack((turned(sides, np.full(80, angle)) + place, random.random(80)))))
     shift = laid_on_each_other(parts, path + wrong, yaw, np.ones(8))
     before, after = (offset - offset.mean(0) for offset in (wrong, wrong + shift))
-    assert np.abs(after).max() < 0.3 * np.abs(before).max()
+    assert np.sqrt((after**2).mean()) < 0.5 * np.sqrt((before**2).mean())
     assert shift.mean(0) == pytest.approx(0, abs=1e-9)
 
 
@@ -283,7 +280,7 @@ def test_scans_that_cannot_be_are_refused():
     nowhere = np.zeros((0, 3))
     with pytest.raises(ValueError, match="frame 3 has 1 broken of 2 points"):
         Scan(3, 0.0, np.array([[0, 0, np.nan], [1, 1, 1]]), np.zeros(3))
-    with pytest.raises(ValueError, match="frame 1 is at 0.5 s and frame 2 at 0.5 s"):
+    with pytest.raises(ValueError, match=r"frame 1 is at 0\.5 s and frame 2 at 0\.5 s"):
         instants([Scan(1, 0.5, nowhere, np.zeros(3)), Scan(2, 0.5, nowhere, np.zeros(3))])
     groups = instants([Scan(k // 2, 0.1 * k, nowhere, np.zeros(3)) for k in (3, 1, 2, 0)])
     assert [[scan.seconds for scan in group] for group in groups] == [[0.1, 0.0], [pytest.approx(0.3), 0.2]]
@@ -310,15 +307,14 @@ def test_settings_that_cannot_be_are_refused(given, said):
         ({"frames": np.array([1, 1])}, "must increase"),
         ({"size": np.array([1.0, 0, 1])}, "must be positive"),
         ({"confidence": 1.1}, r"confidence in \[0, 1\]"),
-        ({"returns": np.array([3])}, "a pose and a count for each frame"),
     ],
 )
 def test_objects_that_cannot_be_are_refused(wrong, said):
     poses = upright_poses(np.array([[0.0, 0, 1], [3.0, 4, 1]]), np.array([0.5, 0.5]))
-    good = dict(
-        kind="vehicle", frames=np.array([1, 2]), world_from_object=poses, size=SIZE, size_unsure=SIZE,
-        returns=np.array([4, 5]), confidence=0.5,
-    )  # fmt: skip
+    good = {
+        "kind": "vehicle", "frames": np.array([1, 2]), "world_from_object": poses, "size": SIZE, "size_unsure": SIZE,
+        "returns": np.array([4, 5]), "confidence": 0.5,
+    }  # fmt: skip
     assert FoundObject(**good).path_length == pytest.approx(5)
     assert poses[0, :2, 0] == pytest.approx([np.cos(0.5), np.sin(0.5)])
     assert np.linalg.det(poses[0]) == pytest.approx(1)
