@@ -122,7 +122,7 @@ it is then the same thing."""
 
 
 def _apart(objects: Sequence[_Object], drive: Sequence[Instant]) -> list[_Object]:
-    """Of two that are at one place the one with more returns, those with most returns first."""
+    """Keep the one with more returns of two that are at one place; those with most returns come first."""
     kept: list[_Object] = []
     for one in sorted(objects, key=lambda found: -int(found.fit.counts.sum())):
         if not any(_within(one.fit, other.fit, drive) for other in kept):
