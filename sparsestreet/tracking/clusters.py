@@ -1,4 +1,4 @@
-"""Returns that belong together: neighbors in plan, within a reach that grows with the distance from the lidar."""
+"""Groups of returns that belong together: neighbors in plan, within a reach that grows with the distance from their lidar."""
 
 from dataclasses import dataclass
 
@@ -23,7 +23,7 @@ OUTLINE = (0.02, 0.98)
 
 @dataclass(frozen=True)
 class Cluster:
-    """Returns of one instant that may be one object."""
+    """What of one instant may be one object."""
 
     returns: Returns
     middle: Float64[np.ndarray, "2"]

@@ -33,7 +33,7 @@ class Scan:
 
 @dataclass(frozen=True)
 class Returns:
-    """Returns of one instant, of all its lidars."""
+    """What came back at one instant, to all its lidars."""
 
     points: Float64[np.ndarray, "n 3"]
     origins: Float64[np.ndarray, "n 3"]
