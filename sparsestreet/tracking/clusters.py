@@ -1,4 +1,4 @@
-"""Groups of returns that belong together: neighbors in plan, within a reach that grows with the distance from their lidar."""
+"""Groups of returns: neighbors in plan, within a reach that grows with the distance from their lidar."""
 
 from dataclasses import dataclass
 
