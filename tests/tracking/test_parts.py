@@ -176,9 +176,10 @@ def test_the_road_is_found_below_walls_cars_and_reflections():
         height = 0.12 * plan[:, 0] - 0.05 * plan[:, 1] + random.normal(0, 0.01, 4000)
         inside = (np.abs(plan - (4, 4)) < (2.3, 0.9)).all(1)
         height[inside] += 1.4
+        height[plan[:, 1] > 9] += 8  # a row of houses
         scans.append(np.column_stack((plan, height)))
     scans[0][:40, 2] -= 3  # as in a wet road
-    places = random.uniform(-14, 14, (500, 2))
+    places = random.uniform((-14, -14), (14, 8), (500, 2))
     places[:40] = random.uniform((2.5, 3.4), (5.5, 4.6), (40, 2))
     # Cells are half a meter across, and lows lie up to two deviations deep.
     assert find_ground(scans).below(places) == pytest.approx(0.12 * places[:, 0] - 0.05 * places[:, 1], abs=0.2)
@@ -226,6 +227,9 @@ def test_sides_that_face_the_lidar_are_where_they_are_seen():
     turned_about, _ = find_middles(part, back_and_right, shape, np.zeros((1, 2)), np.array([np.pi]))
     # Of the car that comes the lidar sees front and left: its high ends.
     assert turned_about == pytest.approx(-np.array([[1.0 - 2, 0.4 - 1]]))
+    across, _ = find_middles(part, back_and_right, shape, np.zeros((1, 2)), np.array([np.pi / 2]))
+    # It is behind, and on the left.
+    assert across == pytest.approx(np.array([[1 - 0.4, -1.8 + 2]]))
     person = Shape("pedestrian", SIZE, SIZE)
     assert find_middles(part, back_and_right, person, np.zeros((1, 2)), np.zeros(1))[0] == pytest.approx(
         np.array([[-0.4, -0.35]])
