@@ -42,7 +42,7 @@ def find_ground(scans: Iterable[Float64[np.ndarray, "n 3"]]) -> Ground:
     corner = np.floor(lows[:, :2].min(0) / CELL) * CELL
     cells = ((lows[:, :2] - corner) / CELL).astype(np.int64)
     shape = tuple(cells.max(0) + 1)
-    key = np.ravel_multi_index(tuple(cells.T), shape)
+    key = cells[:, 0] * shape[1] + cells[:, 1]
     order = np.array(np.lexsort((lows[:, 2], key)))
     ids, start, count = np.unique(key[order], return_index=True, return_counts=True)
     heights = np.full(shape, np.nan)
@@ -64,9 +64,9 @@ def _lowest_of_cells(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, 
 
 def _plane(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
     """The plane through most of the low cells, at every cell: a street that climbs must not look like a step."""
-    x, y = np.indices(heights.shape, np.float64)
+    grid = np.indices(heights.shape, np.float64)
     known = np.isfinite(heights)
-    table = np.stack((np.ones(int(known.sum())), x[known], y[known]), 1)
+    table = np.stack((np.ones(int(known.sum())), grid[0][known], grid[1][known]), 1)
     values, weights = heights[known], np.ones(len(table))
     for _ in range(8):
         root = np.sqrt(weights)
@@ -74,7 +74,7 @@ def _plane(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
         error = values - table @ found
         # What stands lies above the road, and little lies below: errors above count less, and less the larger.
         weights = 1 / (1 + (error / np.where(error > 0, 0.2, 1.0)) ** 2)
-    return found[0] + found[1] * x + found[2] * y
+    return found[0] + found[1] * grid[0] + found[2] * grid[1]
 
 
 def _without_what_stands(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
