@@ -235,11 +235,13 @@ class PandaSetReader(RecordedReader):
         if absent := missing_files(paths):
             raise LogError(absent)
         sweeps = {
-            index: LidarSweep(partial(_points, path, world_from_lidar[index]), stamps[index])
+            index: LidarSweep(
+                partial(_points, path, world_from_lidar[index]), stamps[index], world_from_lidar[index, :3, 3]
+            )
             for index, path in enumerate(paths)
         }
         first = read_returns(paths[0], world_from_lidar[0])
-        sweeps[0] = LidarSweep(lambda: first.world, stamps[0])
+        sweeps[0] = LidarSweep(lambda: first.world, stamps[0], world_from_lidar[0, :3, 3])
         local = first.local.numpy()[first.spinning]
         seconds = first.seconds[first.spinning] - stamps[0] / PER_SECOND
         return sweeps, spin_of(np.arctan2(local[:, 1], local[:, 0]), seconds, _PERIOD)
