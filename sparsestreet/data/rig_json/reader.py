@@ -174,9 +174,8 @@ class Part:
                 stamp = frame.stamp if frame.sweep_stamp is None else frame.sweep_stamp
                 reference = near[index] if frame.world_from_vehicle is None else frame.world_from_vehicle[:3, 3]
                 read = partial(read_sweep, frame.sweep, frame, self.table.lidar, drive, reference)
-                sweeps[index] = LidarSweep(
-                    read, stamp, _stood(frame, self.table.lidar.vehicle_from_lidar, stamp, drive)
-                )
+                stood = _stood(frame, self.table.lidar.vehicle_from_lidar, stamp, drive)
+                sweeps[index] = LidarSweep(read, stamp, stood)
         return sweeps
 
     def boxes(self) -> list[Boxes] | None:
