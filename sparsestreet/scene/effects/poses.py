@@ -367,7 +367,7 @@ def _torque(products: Float[Tensor, "4 4"]) -> Float[Tensor, "3"]:
 
 @dataclass(frozen=True, kw_only=True)
 class BoxPosesSettings(PartlessSettings):
-    """Called for where boxes of moving objects tremble, or were found in lidar: the paths of these are smooth and drift.
+    """Called for where boxes of moving objects tremble, or were found in lidar: paths of these are smooth, and drift.
     The rates of the corrections are those of the nodes.
 
     Raises ValueError for a negative threshold.
