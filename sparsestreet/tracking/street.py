@@ -79,17 +79,17 @@ def assumptions(log: DrivingLog) -> list[str]:
 def scans_of(log: DrivingLog, held_out: frozenset[int]) -> list[Scan]:
     """Return a scan of each frame; one without points where the frame is held out or has no sweep."""
     amid = _amid_cameras(log.views)
-    moments = _moments(log)
-    scans = {frame: Scan(frame, moments[frame][0], np.zeros((0, 3)), amid[frame]) for frame in amid}
+    at = moments(log)
+    scans = {frame: Scan(frame, at[frame][0], np.zeros((0, 3)), amid[frame]) for frame in amid}
     for sweep in log.sweeps.where(lambda index: index not in held_out).gray():
         origin = amid[sweep.index] if sweep.origin is None else sweep.origin.double().numpy()
-        scans[sweep.index] = Scan(sweep.index, moments[sweep.index][0], sweep.points.double().numpy(), origin)
+        scans[sweep.index] = Scan(sweep.index, at[sweep.index][0], sweep.points.double().numpy(), origin)
     return [scans[frame] for frame in sorted(scans)]
 
 
 def tracks_of(log: DrivingLog, objects: Sequence[FoundObject], classes: Mapping[str, str]) -> tuple[Track, ...]:
     """Return objects as tracks of the log, timed by its clock: each box is of the instant of its frame's sweep."""
-    moments = _moments(log)
+    at = moments(log)
     seen: dict[int, list[float]] = {}
     for view in log.views:
         seen.setdefault(view.indices[0], []).append(view.time)
@@ -103,7 +103,7 @@ def tracks_of(log: DrivingLog, objects: Sequence[FoundObject], classes: Mapping[
             torch.from_numpy(each.size).float(),
             found=True,
         )
-        times = [moments[frame][1] for frame in track.frames.tolist()]
+        times = [at[frame][1] for frame in track.frames.tolist()]
         tracks.append(with_times(track, times, seen) if log.stamps else track)
     return tuple(tracks)
 
@@ -142,7 +142,7 @@ def _corners(pose: Float64[Tensor, "4 4"], size: Tensor) -> Float64[Tensor, "4 2
     return pose[:2, 3] + (signs * size[:2] / 2) @ pose[:2, :2].T
 
 
-def _moments(log: DrivingLog) -> dict[int, tuple[float, float]]:
+def moments(log: DrivingLog) -> dict[int, tuple[float, float]]:
     """Frame -> seconds and normalized time of its sweep; of its first image, where no stamp tells.
 
     Normalized time is a line through the stamps of images. No sweep is read.

@@ -103,10 +103,9 @@ def test_found_boxes_carry_returns_as_annotated_ones_do():
     tracks = tracks_of(plain, [found_of(annotated.tracks[0])], CLASSES)
     own = plain.with_tracks(tracks)
     assert not torch.equal(there(plain.frames[0].depth), there(own.frames[0].depth))
-    assert own.is_annotated and not plain.is_annotated
-    pairs = [(annotated, own)]
-    pairs.append(tuple(StreetData(log, stride=4, offset=2).driving_log for log in pairs[0]))  # type: ignore[arg-type]
-    for wanted, got in pairs:
+    assert (own.is_annotated, plain.is_annotated) == (True, False)
+    split, own_split = (StreetData(log, stride=4, offset=2).driving_log for log in (annotated, own))
+    for wanted, got in ((annotated, own), (split, own_split)):
         for one, other in zip(wanted.frames, got.frames, strict=True):
             torch.testing.assert_close(there(one.depth), there(other.depth), rtol=0, atol=1e-5)
         for one, other in zip(wanted.sweeps, got.sweeps, strict=True):
