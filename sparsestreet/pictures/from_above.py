@@ -18,6 +18,11 @@ COLORS = {"vehicle": "#0072B2", "cyclist": "#009E73", "pedestrian": "#D55E00"}
 _DRIVEN, _STILL = "#333333", "#c4c4c4"
 _MARGIN = 12.0
 """Meters around what is shown."""
+_ASPECT = 0.75
+_LEAST = 24
+"""Pixels of a part of an image, at least."""
+_DRAWN = 240
+"""Pixels that its width is scaled to at least, before lines are drawn."""
 _EDGES = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """Of ``BOX_CORNERS``."""
 BOX_CORNERS = np.array([[x, y, z] for x in (1, -1) for y in (1, -1) for z in (1, -1)]) / 2
@@ -103,24 +108,26 @@ def _to_the_right(driven: Float64[np.ndarray, "p 2"]) -> Float64[np.ndarray, "2 
 
 
 def box_in_image(
-    image: UInt8[np.ndarray, "h w 3"], corners: Float64[np.ndarray, "8 2"], kind: str, around: float = 1.6
+    image: UInt8[np.ndarray, "h w 3"], corners: Float64[np.ndarray, "8 2"], kind: str, around: float = 1.5
 ) -> UInt8[np.ndarray, "a b 3"]:
-    """Return the part of an image around a box, with the box drawn on it; its front is thicker.
+    """Return the part of an image around a box, three quarters as high as it is wide, with the box drawn on it.
+
+    The lines of its front are thicker.
 
     Args:
         image: whole.
         corners: pixels of ``BOX_CORNERS``, those of a box in front of the camera.
         kind: of the object.
-        around: sides of the part, of those of the box.
+        around: sides of the part, of those of the box; where the image ends there is less.
     """
-    half = np.maximum((corners.max(0) - corners.min(0)) * around / 2, 12.0)
-    half[1] = max(half[1], 0.6 * half[0])  # no tile is a mere strip
-    middle, (height, width) = (corners.max(0) + corners.min(0)) / 2, image.shape[:2]
-    left, top = np.clip(np.floor(middle - half), 0, (width - 2, height - 2)).astype(int)
-    right, bottom = np.clip(np.ceil(middle + half), (left + 2, top + 2), (width, height)).astype(int)
-    part = image[top:bottom, left:right]
-    scale = max(1, -(-160 // part.shape[1]))
-    drawn = Image.fromarray(part).resize((part.shape[1] * scale, part.shape[0] * scale), Image.Resampling.BICUBIC)
+    wide, tall = around * (corners.max(0) - corners.min(0))
+    size = np.maximum(np.ceil([max(wide, tall / _ASPECT), max(tall, wide * _ASPECT)]), _LEAST).astype(int)
+    size = np.minimum(size, (image.shape[1], image.shape[0]))
+    middle = (corners.max(0) + corners.min(0)) / 2
+    left, top = np.clip(np.floor(middle - size / 2).astype(int), 0, (image.shape[1], image.shape[0]) - size)
+    part = image[top : top + size[1], left : left + size[0]]
+    scale = max(1, -(-_DRAWN // int(size[0])))
+    drawn = Image.fromarray(part).resize((int(size[0]) * scale, int(size[1]) * scale), Image.Resampling.BICUBIC)
     draw = ImageDraw.Draw(drawn)
     ends = [tuple(map(float, point)) for point in (corners - (left, top)) * scale]
     for place, (one, other) in enumerate(_EDGES):

@@ -165,7 +165,7 @@ def _returns(
 
 
 def _tile(log: "DrivingLog", each: "FoundObject", track: "Track") -> "Tile | None":
-    """The object in the image that shows most of it; None where no image shows it whole."""
+    """The object in the image that shows it best; None where none shows its middle."""
     from sparsestreet.pictures.from_above import box_in_image
     from sparsestreet.pictures.sheets import Tile
 
@@ -173,15 +173,22 @@ def _tile(log: "DrivingLog", each: "FoundObject", track: "Track") -> "Tile | Non
     returns = dict(zip(each.frames.tolist(), each.returns.tolist(), strict=True))
     for place, view in enumerate(log.views):
         if returns.get(view.indices[0], 0) and (corners := _corners_in(view, track)) is not None:
-            area = float(np.prod(corners.max(0) - corners.min(0)))
-            best, shown = ((place, corners), area) if area > shown else (best, shown)
+            score = _shown(corners, (view.camera.width, view.camera.height))
+            best, shown = ((place, corners), score) if score > shown else (best, shown)
     if best is None:
         return None
     place, corners = best
     pixels = (255 * log.frames[place].image).round().byte().numpy()
     frame, camera = log.views[place].indices
     name = log.camera_names[camera] if log.camera_names else str(camera)
-    return Tile(f"{track.name}, {each.kind}: frame {frame}, {name}", box_in_image(pixels, corners, each.kind))
+    return Tile(f"{track.name}, {each.kind}: frame {frame}, camera {name}", box_in_image(pixels, corners, each.kind))
+
+
+def _shown(corners: "Float64[np.ndarray, '8 2']", size: tuple[int, int]) -> float:
+    """Pixels of the rectangle around a box that lie in the image; a box that is cut by its edge counts for less."""
+    low, high = corners.min(0), corners.max(0)
+    whole, inside = float(np.prod(high - low)), float(np.prod(np.minimum(high, size) - np.maximum(low, 0)))
+    return inside * (inside / whole) ** 2
 
 
 def _corners_in(view: "View", track: "Track") -> "Float64[np.ndarray, '8 2'] | None":
