@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from omegaconf import OmegaConf
 
 from sparsestreet.cli.config.log_from_options import UsageError, configured_log, reader_of
 from sparsestreet.cli.config.validate import type_problem
@@ -42,7 +43,7 @@ def tracks(arguments: Sequence[str]) -> int:
     cfg, told = configured_log(words, Path(folders[0]) if folders else None, no_log=NO_LOG, one_log=ONE_LOG)
     if cfg.tracks.name != "found":
         raise UsageError(f"this command finds tracks, and tracks={cfg.tracks.name} does not: leave it out")
-    if problem := type_problem({"tracks": cfg.tracks}):
+    if problem := type_problem({"tracks": OmegaConf.to_container(cfg.tracks, resolve=True)}):
         raise UsageError(problem)
     if told:
         print(told)
@@ -55,7 +56,7 @@ def _lines(cfg: "DictConfig", to: Path | None) -> "Iterator[str]":
     from dataclasses import replace
 
     from sparsestreet.cli.config.targets import made
-    from sparsestreet.cli.runs.run import found_classes
+    from sparsestreet.cli.runs.run import found_classes, joins
     from sparsestreet.kept import Kept
     from sparsestreet.pictures.from_above import kinds_in_words
     from sparsestreet.tracking.street import assumptions, check_lidar, found_objects, joined, tracks_of
@@ -72,7 +73,7 @@ def _lines(cfg: "DictConfig", to: Path | None) -> "Iterator[str]":
     yield from table(log, objects)
     found = tracks_of(log, objects, found_classes(cfg))
     out = Path("outputs/tracks") / log.name if to is None else to
-    yield from _boxes(log.with_tracks(joined(log.tracks, found) if cfg.tracks.join else found), out)
+    yield from _boxes(log.with_tracks(joined(log.tracks, found) if joins(cfg) else found), out)
     yield from _pictures(log, objects, found, out)
 
 

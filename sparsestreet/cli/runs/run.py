@@ -94,7 +94,15 @@ def _with_tracks(cfg: DictConfig, log: DrivingLog) -> DrivingLog:
     settings = instantiate(asked["settings"]) if "settings" in asked else TrackingSettings()
     parts = split(log, stride=cfg.split.stride, offset=cfg.split.offset, cameras=cfg.split.cameras)
     found = found_tracks(log, settings, parts.held_out_indices, found_classes(cfg))
-    return log.with_tracks(joined(log.tracks, found) if asked.get("join") else found)
+    return log.with_tracks(joined(log.tracks, found) if joins(cfg) else found)
+
+
+def joins(cfg: DictConfig) -> bool:
+    """Whether found objects join the log's own. Raises ValueError for what is neither true nor false."""
+    join = (cfg.get("tracks") or {}).get("join", False)
+    if not isinstance(join, bool):
+        raise ValueError(f"tracks.join is true or false, got {join!r}")
+    return join
 
 
 def _has_objects(cfg: DictConfig) -> bool:

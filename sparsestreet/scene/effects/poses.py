@@ -388,7 +388,7 @@ class BoxPosesSettings(PartlessSettings):
     def detect(self, data: TrainingData) -> Finding:
         moving = [track for track in data.log.tracks if displacement(track) > _MOVES]
         if drifting := sum(track.found for track in moving):
-            reason = f"{drifting} moving objects are found, not annotated: they do not tremble, but may drift"
+            reason = f"{drifting} moving objects are found, not annotated: boxes on smooth paths, which may drift"
             return Finding(called_for=True, reason=reason, unit="cm", threshold=self.threshold)
         found = box_jitter(moving, data.held_out)
         if found is None:
