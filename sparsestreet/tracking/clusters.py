@@ -7,13 +7,14 @@ from jaxtyping import Float64, Int64
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from sparsestreet.tracking.ground import Ground
 from sparsestreet.tracking.scans import Returns
 from sparsestreet.tracking.settings import TrackingSettings
 
 PLAN_CELL = 0.2
 """Meters: returns of one cell in plan are neighbors anyway, which leaves fewer to compare."""
-MIN_RETURNS, MIN_HEIGHT = 3, 0.25
-"""What has fewer returns, or spans less height, is noise; meters."""
+MIN_RETURNS, MIN_HEIGHT = 3, 0.5
+"""What has fewer returns, or none so high above the road, is noise; meters."""
 MAX_RETURNS = 400
 """Returns of a cluster that are kept: more say no more about its outline."""
 OUTLINE = (0.02, 0.98)
@@ -36,12 +37,13 @@ class Cluster:
         return Cluster(returns.thinned(MAX_RETURNS), (low + high) / 2, float((high - low).max()))
 
 
-def find_clusters(returns: Returns, settings: TrackingSettings) -> list[Cluster]:
+def find_clusters(returns: Returns, ground: Ground, settings: TrackingSettings) -> list[Cluster]:
     """Return the clusters of one instant's moving returns."""
     labels = cluster_labels(returns, settings)
     order = np.argsort(labels, kind="stable")
     parts = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(order) else []
-    large = [part for part in parts if len(part) >= MIN_RETURNS and np.ptp(returns.points[part, 2]) >= MIN_HEIGHT]
+    heights = returns.points[:, 2] - ground.below(returns.points)
+    large = [part for part in parts if len(part) >= MIN_RETURNS and heights[part].max() >= MIN_HEIGHT]
     return [Cluster.of(returns.where(part)) for part in large]
 
 

@@ -22,6 +22,18 @@ MANY_RETURNS = 20
 
 
 @dataclass(frozen=True)
+class Box:
+    """A place of an object."""
+
+    middle: Float64[np.ndarray, "2"]
+    """In plan, meters, world."""
+    yaw: float
+    bottom: float
+    """Height of the road."""
+    size: Float64[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
 class Fit:
     """An object at every step from its first to its last."""
 
@@ -38,10 +50,10 @@ class Fit:
     error: float
     """Median distance from the path to where single instants put the middle, meters."""
 
-    def at(self, step: int) -> tuple[Float64[np.ndarray, "2"], float]:
-        """Return middle and yaw at a step between the first and the last."""
+    def at(self, step: int) -> Box:
+        """Return the box at a step between the first and the last."""
         row = step - int(self.steps[0])
-        return self.path[row], float(self.yaw[row])
+        return Box(self.path[row], float(self.yaw[row]), float(self.bottom[row]), self.shape.size)
 
 
 def fit(chain: Chain, seconds: Float64[np.ndarray, " t"], ground: Ground, *, refine: bool) -> Fit:

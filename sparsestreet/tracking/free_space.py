@@ -15,6 +15,8 @@ MIN_RANGE = 1.5
 """Meters; nearer places are the recording car's."""
 MIN_RAYS = 2
 """Rays around a place's direction without which a scan says nothing of it."""
+BLOCKS = (1, 2)
+"""Sizes of bins, as multiples of the settings' ones: lidars of few beams leave the small ones empty."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +28,13 @@ class RangeImage:
     rays: Int64[np.ndarray, "a e"]
 
     @staticmethod
-    def of(offsets: Float64[np.ndarray, "n 3"], settings: TrackingSettings) -> "RangeImage":
-        """Return the image of returns, given from their lidar, along the axes of the world."""
-        shape = _bins(settings)
-        ranges, azimuth, elevation = _polar(offsets, settings)
-        bins = (azimuth.astype(np.int64) % shape[0]) * shape[1] + elevation.astype(np.int64)
+    def of(polar: "Polar", azimuth_bin: float, elevation_bin: float) -> "RangeImage":
+        """Return the image of the returns of a scan; bins in degrees."""
+        shape = round(360 / azimuth_bin), int(np.ceil(180 / elevation_bin)) + 1
+        rows, columns = polar.bins(shape, elevation_bin)
+        bins = (rows.astype(np.int64) % shape[0]) * shape[1] + columns.astype(np.int64)
         nearest = np.full(shape[0] * shape[1], np.inf, np.float32)
-        np.minimum.at(nearest, bins, ranges.astype(np.float32))
+        np.minimum.at(nearest, bins, polar.ranges.astype(np.float32))
         nearest = nearest.reshape(shape)
         rays = np.bincount(bins, minlength=nearest.size).reshape(shape)
         nearest = np.minimum(nearest, np.roll(nearest, -1, 0))
@@ -41,33 +43,56 @@ class RangeImage:
         rays[:, :-1] += rays[:, 1:].copy()
         return RangeImage(nearest, rays)
 
-    def sees_through(self, offsets: Float64[np.ndarray, "n 3"], settings: TrackingSettings) -> Bool[np.ndarray, " n"]:
-        """Return which places the rays around them pass: all of the block of bins whose middle is nearest end behind.
-
-        A ray that never came back says nothing.
-        """
-        ranges, azimuth, elevation = _polar(offsets, settings)
+    def ahead(self, polar: "Polar", elevation_bin: float) -> tuple[Float32[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+        """Return for each place the nearest range, and the number, of the rays in the block with the nearest middle."""
         shape = self.nearest.shape
-        rows = np.floor(azimuth - 0.5).astype(np.int64) % shape[0]
-        columns = np.clip(np.floor(elevation - 0.5).astype(np.int64), 0, shape[1] - 1)
-        ahead = self.nearest[rows, columns]
-        behind = np.maximum(settings.behind, settings.behind_share * ranges)
-        passed = np.isfinite(ahead) & (ahead > ranges + behind)
-        return passed & (self.rays[rows, columns] >= MIN_RAYS) & (ranges > MIN_RANGE)
+        rows, columns = polar.bins(shape, elevation_bin)
+        block = np.floor(rows - 0.5).astype(np.int64) % shape[0]
+        level = np.clip(np.floor(columns - 0.5).astype(np.int64), 0, shape[1] - 1)
+        return self.nearest[block, level], self.rays[block, level]
 
 
-def _bins(settings: TrackingSettings) -> tuple[int, int]:
-    return round(360 / settings.azimuth_bin), int(np.ceil(180 / settings.elevation_bin)) + 1
+@dataclass(frozen=True)
+class Polar:
+    """Places as a lidar sees them."""
+
+    ranges: Float64[np.ndarray, " n"]
+    azimuth: Float64[np.ndarray, " n"]
+    """Turns, from 0 to 1."""
+    elevation: Float64[np.ndarray, " n"]
+    """Degrees above straight down."""
+
+    @staticmethod
+    def of(offsets: Float64[np.ndarray, "n 3"]) -> "Polar":
+        """Return places given from their lidar, meters, along the axes of the world."""
+        plan = np.hypot(offsets[:, 0], offsets[:, 1])
+        azimuth = np.arctan2(offsets[:, 1], offsets[:, 0]) / (2 * np.pi) + 0.5
+        return Polar(np.hypot(plan, offsets[:, 2]), azimuth, np.degrees(np.arctan2(offsets[:, 2], plan)) + 90)
+
+    def bins(
+        self, shape: tuple[int, ...], elevation_bin: float
+    ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+        """Return where they lie in an image of this shape, in bins."""
+        return self.azimuth * shape[0], self.elevation / elevation_bin
 
 
-def _polar(
-    offsets: Float64[np.ndarray, "n 3"], settings: TrackingSettings
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Range in meters, azimuth and elevation in bins from 0 on."""
-    plan = np.hypot(offsets[:, 0], offsets[:, 1])
-    azimuth = (np.arctan2(offsets[:, 1], offsets[:, 0]) / (2 * np.pi) + 0.5) * _bins(settings)[0]
-    elevation = (np.degrees(np.arctan2(offsets[:, 2], plan)) + 90) / settings.elevation_bin
-    return np.hypot(plan, offsets[:, 2]), azimuth, elevation
+def seen_through(
+    returns: Float64[np.ndarray, "n 3"], places: Float64[np.ndarray, "c 3"], settings: TrackingSettings
+) -> Bool[np.ndarray, " c"]:
+    """Return which places a scan sees through: all rays around them end behind. Both are given from the lidar, meters.
+
+    The rays are those of a block of 2 x 2 bins, and where these are fewer than two, of one twice as large. A ray that
+    never came back says nothing.
+    """
+    rays, seen = Polar.of(returns), Polar.of(places)
+    nearest, enough = np.full(len(places), np.inf, np.float32), np.zeros(len(places), bool)
+    for scale in BLOCKS:
+        azimuth_bin, elevation_bin = scale * settings.azimuth_bin, scale * settings.elevation_bin
+        ahead, count = RangeImage.of(rays, azimuth_bin, elevation_bin).ahead(seen, elevation_bin)
+        nearest = np.where(enough, nearest, ahead)
+        enough |= count >= MIN_RAYS
+    behind = np.maximum(settings.behind, settings.behind_share * seen.ranges)
+    return enough & (nearest > seen.ranges + behind) & (seen.ranges > MIN_RANGE)
 
 
 @dataclass(frozen=True)
@@ -124,8 +149,7 @@ def count_views(
         here = np.zeros(len(cells.means), np.float32)
         here[rows] = 1
         taken = cells.near @ here > 0
-        image = RangeImage.of(scan.points - scan.origin, settings)
-        free += image.sees_through(cells.means - scan.origin, settings) & ~taken
+        free += seen_through(scan.points - scan.origin, cells.means - scan.origin, settings) & ~taken
         occupied += taken
         report(number + 1, len(scans))
     return [occupied[rows] for rows in cells.rows], [free[rows] for rows in cells.rows]

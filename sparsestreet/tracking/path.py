@@ -12,6 +12,9 @@ ROBUST_SCALE, ROBUST_ROUNDS = 0.3, 4
 """Meters: a place this far from the path counts half. How often weights and path are computed in turn."""
 ALMOST_NOTHING = 1e-9
 """Weight of steps at which nothing was measured: the path is then sought by its smoothness alone."""
+BEND = 2.0
+"""Weight of the penalty on accelerations. It is nothing beside measured places, but where there are none, or hardly
+any, the path goes straight on."""
 HEADING_REACH = 0.5
 """Seconds ahead and behind between which the direction of motion is taken."""
 MIN_SPEED = 0.4
@@ -27,9 +30,9 @@ def smooth(
 ) -> Float64[np.ndarray, "s d"]:
     """Return the path at every step from the first to the last that was measured.
 
-    It minimizes sum w |p - m|^2 + stiffness sum (jerk dt^3)^2 step / dt with dt = 0.1 s, where jerk is the third
-    divided difference times 3!; a penalty on the integral of the squared jerk, whatever the rate of the log. Places far
-    off count less (Cauchy's weights).
+    It minimizes sum w |p - m|^2 + stiffness sum (jerk dt^3)^2 step / dt + BEND sum (acceleration dt^2)^2 step / dt with
+    dt = 0.1 s, where the derivatives are divided differences: penalties on integrals, whatever the rate of the log.
+    Places far off count less (Cauchy's weights).
 
     Args:
         steps: increasing; of the measured places.
@@ -39,10 +42,13 @@ def smooth(
         stiffness: weight of the penalty.
     """
     first, last = int(steps[0]), int(steps[-1])
-    order = min(3, last - first)
-    if order < 1:
+    if last == first:
         return places.copy()
-    bands = stiffness * _penalty(seconds[first : last + 1], order)
+    own = seconds[first : last + 1]
+    bands = np.zeros((4, len(own)))
+    for order, weight in ((3, stiffness), (2, BEND)):
+        if order < len(own):
+            bands[3 - order :] += weight * _penalty(own, order)
     at = steps - first
     robust = np.ones(len(steps))
     target = np.zeros((last - first + 1, places.shape[1]))
