@@ -19,7 +19,7 @@ _DRIVEN, _STILL = "#333333", "#c4c4c4"
 _MARGIN = 12.0
 """Meters around what is shown."""
 _ASPECT = 0.75
-_LEAST = 24
+_MIN_PART = 24
 """Pixels of a part of an image, at least."""
 _DRAWN = 240
 """Pixels that its width is scaled to at least, before lines are drawn."""
@@ -121,7 +121,7 @@ def box_in_image(
         around: sides of the part, of those of the box; where the image ends there is less.
     """
     wide, tall = around * (corners.max(0) - corners.min(0))
-    size = np.maximum(np.ceil([max(wide, tall / _ASPECT), max(tall, wide * _ASPECT)]), _LEAST).astype(int)
+    size = np.maximum(np.ceil([max(wide, tall / _ASPECT), max(tall, wide * _ASPECT)]), _MIN_PART).astype(int)
     size = np.minimum(size, (image.shape[1], image.shape[0]))
     middle = (corners.max(0) + corners.min(0)) / 2
     left, top = np.clip(np.floor(middle - size / 2).astype(int), 0, (image.shape[1], image.shape[0]) - size)
