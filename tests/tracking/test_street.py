@@ -12,7 +12,7 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import LidarSweep
 from sparsestreet.kept import Kept
 from sparsestreet.tracking import street
-from sparsestreet.tracking.objects import FoundObject, Kind, upright_poses
+from sparsestreet.tracking.objects import FoundObject, upright_poses
 from sparsestreet.tracking.scans import Scan
 from sparsestreet.tracking.settings import TrackingSettings
 from sparsestreet.tracking.street import assumptions, found_tracks, joined, scans_of, tracks_of
@@ -21,7 +21,7 @@ from tests.data.plan import Plan
 from tests.data.test_recording import boxes, read, recording, sweep
 from tests.typed import there
 
-CLASSES: dict[Kind, str] = {"vehicle": "Car", "cyclist": "Cyclist", "pedestrian": "Pedestrian"}
+CLASSES: dict[str, str] = {"vehicle": "Car", "cyclist": "Cyclist", "pedestrian": "Pedestrian"}
 PLAN = Plan()
 LATE = tuple(int(stamp) + 40_000_000 + 5_000_000 * frame for frame, stamp in enumerate(PLAN.stamps))
 """Stamps of sweeps that are no frame's."""
