@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from sparsestreet.tracking.association import Chain, associate
 from sparsestreet.tracking.clusters import find_clusters
@@ -48,12 +48,12 @@ def find_objects(
         if len(within) < settings.min_frames:
             continue
         core = fitted(within)
-        if _is_object(core, drive, seconds, settings):
+        if _is_object(core, drive, seconds, settings, settings.min_moved):
             whole = Chain.merged((within, extended(core, drive, seconds, settings)))
             objects.append(fit(whole, seconds, ground, refine=True))
-    objects = [one for one in objects if _is_object(one, drive, seconds, settings)]
+    objects = [one for one in objects if _is_object(one, drive, seconds, settings, _least_way(one, settings))]
     frames = np.array([group[0].frame for group in groups], np.int64)
-    return tuple(_found(one, frames) for one in _apart(objects))
+    return tuple(_found(one, frames, _confidence(one, drive)) for one in _apart(objects))
 
 
 def _moves(chain: Chain) -> bool:
@@ -64,21 +64,31 @@ def _moves(chain: Chain) -> bool:
 
 MAX_ERROR = 0.5
 """Meters, of the median distance between single instants and the path."""
+MANY_RETURNS = 10
+"""Returns a step; an object with fewer must get farther."""
 MAX_PERSON = 2.4
 """Meters: people and cyclists are no higher, but leaves are."""
 MIN_STRAIGHT, MIN_SEEN = 0.5, 0.4
 """Least share of its path by which an object gets away from its first place, and of its steps at which it is seen."""
 
 
+def _least_way(found: Fit, settings: TrackingSettings) -> float:
+    """How far an object must get, meters: what has few returns goes some way by noise alone."""
+    return settings.min_moved if np.median(found.counts) >= MANY_RETURNS else settings.min_moved_few
+
+
 def _is_object(
-    found: Fit, drive: Sequence[Instant], seconds: Float64[np.ndarray, " t"], settings: TrackingSettings
+    found: Fit,
+    drive: Sequence[Instant],
+    seconds: Float64[np.ndarray, " t"],
+    settings: TrackingSettings,
+    least: float,
 ) -> bool:
-    """Whether it goes somewhere, as leaves and the edges of what stands do not."""
+    """Whether it goes somewhere, as leaves and the edges of what stands do not; ``least`` meters at least."""
     going = found.speed >= MIN_SPEED
     steps = np.linalg.norm(np.diff(found.path, axis=0), axis=1)
     walked = steps[going[1:] | going[:-1]].sum()
     moved = np.linalg.norm(found.path[-1] - found.path[0])
-    least = settings.min_moved if np.median(found.counts) >= 10 else settings.min_moved_few
     mean_speed = walked / (seconds[found.steps[-1]] - seconds[found.steps[0]])
     goes = moved > least and moved > MIN_STRAIGHT * walked and mean_speed < settings.max_speed
     clear = found.error < MAX_ERROR and (found.counts > 0).mean() > MIN_SEEN
@@ -110,15 +120,16 @@ def _within(one: Fit, other: Fit) -> bool:
     return bool((np.abs(local) < other.shape.size[:2] / 2).all(1).mean() > MAX_INSIDE)
 
 
-def _found(one: Fit, frames: np.ndarray) -> FoundObject:
+def _confidence(found: Fit, drive: Sequence[Instant]) -> float:
+    """Product of the share of its steps at which it is seen, of the share of its returns that move, and of
+    n / (n + 2) with the median number n of returns of a step."""
+    seen = found.counts[found.counts > 0]
+    few = np.median(seen) / (np.median(seen) + 2)
+    return float(len(seen) / len(found.counts) * moving_share(found, drive, MIN_SPEED) * few)
+
+
+def _found(one: Fit, frames: Int64[np.ndarray, " t"], confidence: float) -> FoundObject:
     middle = np.column_stack((one.path, one.bottom + one.shape.size[2] / 2))
-    seen = float((one.counts > 0).mean())
-    return FoundObject(
-        kind=one.shape.kind,
-        frames=frames[one.steps],
-        world_from_object=upright_poses(middle, one.yaw),
-        size=one.shape.size,
-        size_unsure=one.shape.unsure,
-        returns=one.counts,
-        confidence=seen,
-    )
+    poses = upright_poses(middle, one.yaw)
+    shape = one.shape
+    return FoundObject(shape.kind, frames[one.steps], poses, shape.size, shape.unsure, one.counts, confidence)

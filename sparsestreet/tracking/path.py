@@ -18,7 +18,7 @@ any, the path goes straight on."""
 HEADING_REACH = 0.5
 """Seconds ahead and behind between which the direction of motion is taken."""
 MIN_SPEED = 0.4
-"""Meters per second, below which the direction of motion is noise, and the heading is held."""
+"""Meters per second, below which a thing stands."""
 
 
 def smooth(
@@ -79,11 +79,13 @@ def _penalty(seconds: Float64[np.ndarray, " s"], order: int) -> Float64[np.ndarr
 
 
 def headings(
-    path: Float64[np.ndarray, "s 2"], seconds: Float64[np.ndarray, " s"]
+    path: Float64[np.ndarray, "s 2"], seconds: Float64[np.ndarray, " s"], min_speed: float
 ) -> tuple[Float64[np.ndarray, " s"], Float64[np.ndarray, " s"]]:
     """Return yaw in radians, unwrapped, and speed in meters per second at each step of a path.
 
-    Yaw is the direction of motion, between its neighbors in time where the object stands, and 0 if it always does.
+    Yaw is the direction of motion where it is faster than ``min_speed``, or than half its fastest if it is always slow.
+    Elsewhere it lies between that before and behind, since the direction of what stands is noise. A path of one step
+    has yaw 0.
     """
     number = np.arange(len(path))
     ahead = np.searchsorted(seconds, seconds + HEADING_REACH + 1e-6, side="right") - 1
@@ -92,9 +94,7 @@ def headings(
     ahead, behind = np.minimum(ahead, len(path) - 1), np.maximum(behind, 0)
     moved = path[ahead] - path[behind]
     speed = np.linalg.norm(moved, axis=1) / np.maximum(seconds[ahead] - seconds[behind], 1e-6)
-    sure = np.flatnonzero(speed > MIN_SPEED)
-    if not len(sure):
-        return np.zeros(len(path)), speed
+    sure = np.flatnonzero(speed >= min(min_speed, speed.max() / 2))
     yaw = np.unwrap(np.arctan2(moved[sure, 1], moved[sure, 0]))
     return np.interp(number, sure, yaw), speed
 

@@ -17,8 +17,15 @@ SEEN_SPAN = 0.9
 is noise."""
 MIN_FULL_LENGTH = 3.3
 """Meters: of a vehicle that never shows more, only its back or front was seen."""
+LARGE_WIDTH, LARGE_HEIGHT, MIN_LARGE_LENGTH, LARGE_LENGTH = 2.1, 2.6, 6.0, 10.0
+"""Meters: buses, trucks and trams are so wide and high. Of one that shows less than the third number only an end is
+seen; the last is then its length. What shows less than the last may be longer by as much."""
+PADDING = (0.2, 0.05)
+"""Meters of length and width that the quantiles leave out: bumpers, and the rounded sides."""
 MAX_LENGTH, MAX_WIDTH, MAX_HEIGHT = 30.0, 3.0, 4.2
 """Meters."""
+MIN_UNSURE = 0.1
+"""Meters by which a side may be off that is seen from end to end."""
 WHOLE = 0.8
 """Share of its length that an instant must show to say where the middle of a vehicle is."""
 
@@ -29,7 +36,9 @@ class Shape:
 
     kind: Kind
     size: Float64[np.ndarray, "3"]
+    """Length, width, height, meters."""
     unsure: Float64[np.ndarray, "3"]
+    """Meters by which each may be off."""
 
 
 def outlines(
@@ -62,16 +71,20 @@ def find_shape(
     seen = np.array([*np.quantile((outline[:, 1] - outline[:, 0])[shown], SEEN_SPAN, axis=0), height])
     kind = kind_of(seen[0], seen[1], speed)
     usual = np.array(USUAL_SIZES[kind])
-    size = seen.copy()
-    if kind == "vehicle":
-        if size[0] < MIN_FULL_LENGTH:
-            size[0] = usual[0]
-        size[1] = max(size[1], 1.6 if size[0] > 3 else usual[1])
-        size[:2] = np.minimum(size[:2] + np.array((0.2, 0.05)), (MAX_LENGTH, MAX_WIDTH))
-    else:
-        size = np.maximum(size + np.array((0.2, 0.1, 0.0)), usual)
-    size[2] = np.clip(size[2], 0.9 * usual[2], MAX_HEIGHT)
-    return Shape(kind, size, np.maximum(0.1, np.abs(size - seen)))
+    if kind != "vehicle":
+        size = np.maximum(seen + np.array((0.2, 0.1, 0.0)), usual)
+        size[2] = min(size[2], MAX_HEIGHT)
+        return Shape(kind, size, np.maximum(MIN_UNSURE, size - seen))
+    size, unsure = seen.copy(), np.full(3, MIN_UNSURE)
+    if seen[0] < LARGE_LENGTH and seen[1] > LARGE_WIDTH and seen[2] > LARGE_HEIGHT:
+        size[0] = LARGE_LENGTH if seen[0] < MIN_LARGE_LENGTH else seen[0]
+        unsure[0] = LARGE_LENGTH
+    elif seen[0] < MIN_FULL_LENGTH:
+        size[0] = usual[0]
+    size[1] = max(seen[1], 1.6 if size[0] > 3 else usual[1])
+    size[:2] = np.minimum(size[:2] + np.array(PADDING), (MAX_LENGTH, MAX_WIDTH))
+    size[2] = np.clip(seen[2], 0.9 * usual[2], MAX_HEIGHT)
+    return Shape(kind, size, np.maximum(unsure, np.abs(size - seen)))
 
 
 def find_middles(
