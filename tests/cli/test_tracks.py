@@ -182,5 +182,5 @@ def test_a_street_is_trained_on_what_its_lidar_shows(tmp_path):
     decisions = {decision.name: decision for decision in there(RUN.find(tmp_path / "run")).effects}
     assert decisions["box_poses"].on
     assert "7 moving objects are found, not annotated" in decisions["box_poses"].reason
-    nodes = load_scene(tmp_path / "run").graph.nodes
+    nodes = load_scene(tmp_path / "run").scene.nodes
     assert len(as_a(torch.Tensor, nodes["rigid"].state_dict()["sizes"])) == 7
