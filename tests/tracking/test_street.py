@@ -153,6 +153,7 @@ def test_found_objects_join_annotated_ones_without_doubling():
         box("turned beside it", [0.0, 1.0, 2.0], y=2.9, yaw=np.pi / 2): True,  # it reaches 2 m to its sides
         box("turned, farther", [0.0, 1.0, 2.0], y=3.1, yaw=np.pi / 2): False,
         box("across its corner", [3.0], y=2.0, yaw=-np.pi / 4): False,  # their bounds overlap, they do not
+        box("its corner at a side", [0.0], y=3.2, yaw=np.pi / 4): False,  # they lie apart along that side alone
         box("passing", [-30.0, -20.0, 2.0, 23.0, 34.0, 45.0]): False,  # one of six
         box("meeting", [-30.0, -20.0, 2.0, 3.0, 34.0, 45.0]): True,  # two of six
     }.items():

@@ -66,6 +66,8 @@ def _lines(cfg: "DictConfig", to: Path | None) -> "Iterator[str]":
     check_lidar(log)
     log = log if identity is None else replace(log, kept=Kept(cfg.get("cache"), identity))
     yield from (f"note: {sentence}" for sentence in assumptions(log))
+    if first := cfg.data.log.get("first_frame"):
+        yield f"note: frames are counted from the first that is read, data.log.first_frame={first}, in the files too"
     objects = found_objects(log, made(cfg.tracks.settings))
     if log.kept.found:
         yield str(log.kept)
