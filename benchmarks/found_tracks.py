@@ -71,7 +71,7 @@ def scans_of(log: DrivingLog) -> list[Scan]:
     """Return the sweeps of a log, as if its lidar stood where the first camera of the frame is."""
     places: dict[int, np.ndarray] = {}
     for view in log.views:
-        places.setdefault(view.frame_index, view.camera.position.double().numpy())
+        places.setdefault(view.indices[0], view.camera.position.double().numpy())
     points = {sweep.index: sweep.points.double().numpy() for sweep in log.sweeps.gray()}
     none = np.zeros((0, 3))
     return [

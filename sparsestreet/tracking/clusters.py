@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sparsestreet.tracking.ground import Ground
 from sparsestreet.tracking.scans import Returns
@@ -59,7 +59,7 @@ def cluster_labels(returns: Returns, settings: TrackingSettings) -> Int64[np.nda
     places = returns.points[first, :2]
     away = np.linalg.norm(places - returns.origins[first, :2], axis=1)
     reach = settings.cluster_gap + settings.cluster_gap_share * away
-    rows, columns = cKDTree(places).query_pairs(reach.max(), output_type="ndarray").T
+    rows, columns = KDTree(places).query_pairs(reach.max(), output_type="ndarray").T
     near = np.linalg.norm(places[rows] - places[columns], axis=1) < np.minimum(reach[rows], reach[columns])
     ones = np.ones(int(near.sum()))
     graph = sparse.coo_matrix((ones, (rows[near], columns[near])), shape=(len(places), len(places)))

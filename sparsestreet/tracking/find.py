@@ -1,6 +1,7 @@
 """Find what moves in a drive, in its lidar alone."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -8,13 +9,13 @@ from jaxtyping import Float64, Int64
 
 from sparsestreet.tracking.association import Chain, associate
 from sparsestreet.tracking.clusters import find_clusters
-from sparsestreet.tracking.drive import Instant, gathered, look, moving_share
+from sparsestreet.tracking.drive import COUNT_MARGIN, Instant, gathered, look, moving_share
 from sparsestreet.tracking.extension import extended
 from sparsestreet.tracking.fit import Fit, fit
-from sparsestreet.tracking.ground import find_ground
+from sparsestreet.tracking.ground import Ground, find_ground
 from sparsestreet.tracking.joining import join_chains
 from sparsestreet.tracking.objects import FoundObject, upright_poses
-from sparsestreet.tracking.path import MIN_SPEED, in_frame
+from sparsestreet.tracking.path import MIN_SPEED
 from sparsestreet.tracking.scans import Scan, instant_seconds, instants
 from sparsestreet.tracking.settings import TrackingSettings
 
@@ -35,12 +36,35 @@ def find_objects(
     Raises:
         ValueError: if time does not increase with the frames.
     """
+    if not scans:
+        return ()
     groups = instants(scans)
     seconds = instant_seconds(groups)
     ground = find_ground(scan.points for group in groups for scan in group)
     drive = look(groups, ground, settings, report)
     clusters = [find_clusters(instant.returns.where(instant.moving), ground, settings) for instant in drive]
     chains = [chain for chain in associate(clusters, seconds, settings) if _moves(chain)]
+    objects = _objects(chains, drive, seconds, ground, settings)
+    frames = np.array([group[0].frame for group in groups], np.int64)
+    found = [_found(one, frames) for one in _apart(objects, drive)]
+    return tuple(one for one in found if one.confidence >= settings.min_confidence)
+
+
+@dataclass(frozen=True)
+class _Object:
+    fit: Fit
+    moving: float
+    """Share of the returns of its core that move."""
+
+
+def _objects(
+    chains: Sequence[Chain],
+    drive: Sequence[Instant],
+    seconds: Float64[np.ndarray, " t"],
+    ground: Ground,
+    settings: TrackingSettings,
+) -> list[_Object]:
+    """Join chains to cores, and follow those that are surely objects to where they show little, or stand."""
     fitted = partial(fit, seconds=seconds, ground=ground, refine=False)
     objects = []
     for chain in join_chains(chains, fitted, seconds, settings):
@@ -48,12 +72,13 @@ def find_objects(
         if len(within) < settings.min_frames:
             continue
         core = fitted(within)
-        if _is_object(core, drive, seconds, settings, settings.min_moved):
+        moving = moving_share(core, drive, MIN_SPEED)
+        if moving > settings.min_moving_share and _is_object(core, seconds, settings, settings.min_moved):
             whole = Chain.merged((within, extended(core, drive, seconds, settings)))
-            objects.append(fit(whole, seconds, ground, refine=True))
-    objects = [one for one in objects if _is_object(one, drive, seconds, settings, _least_way(one, settings))]
-    frames = np.array([group[0].frame for group in groups], np.int64)
-    return tuple(_found(one, frames, _confidence(one, drive)) for one in _apart(objects))
+            one = fit(whole, seconds, ground, refine=True)
+            if _is_object(one, seconds, settings, _least_way(one, settings)):
+                objects.append(_Object(one, moving))
+    return objects
 
 
 def _moves(chain: Chain) -> bool:
@@ -77,14 +102,8 @@ def _least_way(found: Fit, settings: TrackingSettings) -> float:
     return settings.min_moved if np.median(found.counts) >= MANY_RETURNS else settings.min_moved_few
 
 
-def _is_object(
-    found: Fit,
-    drive: Sequence[Instant],
-    seconds: Float64[np.ndarray, " t"],
-    settings: TrackingSettings,
-    least: float,
-) -> bool:
-    """Whether it goes somewhere, as leaves and the edges of what stands do not; ``least`` meters at least."""
+def _is_object(found: Fit, seconds: Float64[np.ndarray, " t"], settings: TrackingSettings, least: float) -> bool:
+    """Whether it goes somewhere, ``least`` meters, as leaves and the edges of what stands do not."""
     going = found.speed >= MIN_SPEED
     steps = np.linalg.norm(np.diff(found.path, axis=0), axis=1)
     walked = steps[going[1:] | going[:-1]].sum()
@@ -94,42 +113,48 @@ def _is_object(
     clear = found.error < MAX_ERROR and (found.counts > 0).mean() > MIN_SEEN
     if found.shape.kind != "vehicle" and found.shape.size[2] > MAX_PERSON:
         return False
-    return bool(goes and clear and moving_share(found, drive, MIN_SPEED) > settings.min_moving_share)
+    return bool(goes and clear)
 
 
-MIN_COMMON, MAX_INSIDE = 0.3, 0.3
-"""Share of the steps of an object at which another is there too, and of these, at which its middle lies in the other's
-box: it is then the same thing."""
+MIN_COMMON, MAX_SHARED = 0.3, 0.5
+"""Share of the steps of an object at which another is there too, and of its returns then, that lie in the other's box:
+it is then the same thing."""
 
 
-def _apart(objects: Sequence[Fit]) -> list[Fit]:
+def _apart(objects: Sequence[_Object], drive: Sequence[Instant]) -> list[_Object]:
     """Of two that are at one place the one with more returns, those with most returns first."""
-    kept: list[Fit] = []
-    for one in sorted(objects, key=lambda found: -int(found.counts.sum())):
-        if not any(_within(one, other) for other in kept):
+    kept: list[_Object] = []
+    for one in sorted(objects, key=lambda found: -int(found.fit.counts.sum())):
+        if not any(_within(one.fit, other.fit, drive) for other in kept):
             kept.append(one)
     return kept
 
 
-def _within(one: Fit, other: Fit) -> bool:
+def _within(one: Fit, other: Fit, drive: Sequence[Instant]) -> bool:
     both = np.intersect1d(one.steps, other.steps).tolist()
     if len(both) < MIN_COMMON * len(one.steps):
         return False
-    boxes = [(one.at(step), other.at(step)) for step in both]
-    local = np.array([in_frame(mine.middle[None], box.middle, box.yaw)[0] for mine, box in boxes])
-    return bool((np.abs(local) < other.shape.size[:2] / 2).all(1).mean() > MAX_INSIDE)
+    own = [drive[step].inside(one.at(step), COUNT_MARGIN) for step in both]
+    shared = [
+        np.intersect1d(rows, drive[step].inside(other.at(step), COUNT_MARGIN))
+        for step, rows in zip(both, own, strict=True)
+    ]
+    return sum(map(len, shared)) > MAX_SHARED * sum(map(len, own))
 
 
-def _confidence(found: Fit, drive: Sequence[Instant]) -> float:
-    """Product of the share of its steps at which it is seen, of the share of its returns that move, and of
-    n / (n + 2) with the median number n of returns of a step."""
-    seen = found.counts[found.counts > 0]
-    few = np.median(seen) / (np.median(seen) + 2)
-    return float(len(seen) / len(found.counts) * moving_share(found, drive, MIN_SPEED) * few)
-
-
-def _found(one: Fit, frames: Int64[np.ndarray, " t"], confidence: float) -> FoundObject:
-    middle = np.column_stack((one.path, one.bottom + one.shape.size[2] / 2))
-    poses = upright_poses(middle, one.yaw)
-    shape = one.shape
-    return FoundObject(shape.kind, frames[one.steps], poses, shape.size, shape.unsure, one.counts, confidence)
+def _found(one: _Object, frames: Int64[np.ndarray, " t"]) -> FoundObject:
+    """The confidence is the product of the share of steps at which it is seen, of the share of its returns that move,
+    and of n / (n + 2) with the median number n of returns of a step."""
+    shape, counts = one.fit.shape, one.fit.counts
+    median = float(np.median(counts[counts > 0]))
+    return FoundObject(
+        kind=shape.kind,
+        frames=frames[one.fit.steps],
+        world_from_object=upright_poses(
+            np.column_stack((one.fit.path, one.fit.bottom + shape.size[2] / 2)), one.fit.yaw
+        ),
+        size=shape.size,
+        size_unsure=shape.unsure,
+        returns=counts,
+        confidence=float((counts > 0).mean()) * one.moving * median / (median + 2),
+    )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sparsestreet.tracking.association import Chain
 from sparsestreet.tracking.ground import Ground
@@ -100,7 +100,8 @@ def fit(chain: Chain, seconds: Float64[np.ndarray, " t"], ground: Ground, *, ref
     return Fit(every, path, yaw, speed, bottom, shape, seen, error)
 
 
-REGISTRATION_ROUNDS = 6
+REGISTRATION_ROUNDS, REGISTRATION_GAIN = 6, 1.5
+"""Nearest neighbors lie less far away than the same place does, so more than the mean is made up for."""
 REGISTRATION_REACH = 15
 """Instants of the chain before and behind whose returns an instant is laid upon."""
 REGISTERED_RETURNS = 80
@@ -133,11 +134,11 @@ def laid_on_each_other(
             others = model[(owner != number) & (np.abs(owner - number) <= REGISTRATION_REACH)]
             if min(len(mine), len(others)) < MIN_COMPARED:
                 continue
-            gaps, nearest = cKDTree(others).query(mine, distance_upper_bound=MAX_GAP)
+            gaps, nearest = map(np.asarray, KDTree(others).query(mine, distance_upper_bound=MAX_GAP))
             close = np.isfinite(gaps)
             if close.mean() >= 0.5:
                 mean = (others[nearest[close], :2] - mine[close, :2]).mean(0)
-                offset[number] += np.clip(1.5 * mean, -MAX_SHIFT, MAX_SHIFT)
+                offset[number] += np.clip(REGISTRATION_GAIN * mean, -MAX_SHIFT, MAX_SHIFT)
         offset -= np.average(offset, axis=0, weights=weights)
     # What must move ahead to fall on the others was put too far ahead: its box goes back.
     return -turned(offset, yaw)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy import sparse
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from sparsestreet.tracking.scans import Scan
 from sparsestreet.tracking.settings import TrackingSettings
@@ -123,10 +123,10 @@ def packed(points: Float64[np.ndarray, "n 3"], side: float) -> Int64[np.ndarray,
 
 
 def _near(places: Float64[np.ndarray, "c 3"], reach: float) -> sparse.csr_matrix:
-    pairs = cKDTree(places).query_pairs(reach, output_type="ndarray") if len(places) else np.zeros((0, 2), np.int64)
+    pairs = KDTree(places).query_pairs(reach, output_type="ndarray") if len(places) else np.zeros((0, 2), np.int64)
     ones, shape = np.ones(len(pairs), np.float32), (len(places), len(places))
     one_way = sparse.coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), shape=shape).tocsr()
-    return one_way + one_way.T + sparse.identity(len(places), dtype=np.float32, format="csr")
+    return (one_way + one_way.T + sparse.diags(np.ones(len(places), np.float32))).tocsr()
 
 
 def count_views(

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from scipy import ndimage
 
 CELL = 0.5
@@ -14,6 +14,9 @@ LOW_QUANTILE = 0.2
 of all scans counts, but this quantile."""
 STANDING_SPAN, STANDING_STEP = 11, 0.5
 """Cells across, and meters: what rises more above the lowest cell around it is no road, but something that stands."""
+
+LOW_PERCENTILE = 25
+"""Percentile of the cells around a cell, below which by the same step it is no road either."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ def find_ground(scans: Iterable[Float64[np.ndarray, "n 3"]]) -> Ground:
     cells = ((lows[:, :2] - corner) / CELL).astype(np.int64)
     shape = tuple(cells.max(0) + 1)
     key = np.ravel_multi_index(tuple(cells.T), shape)
-    order = np.lexsort((lows[:, 2], key))
+    order = np.array(np.lexsort((lows[:, 2], key)))
     ids, start, count = np.unique(key[order], return_index=True, return_counts=True)
     heights = np.full(shape, np.nan)
     heights.flat[ids] = lows[order, 2][start + (LOW_QUANTILE * (count - 1)).astype(np.int64)]
@@ -53,7 +56,7 @@ def _lowest_of_cells(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, 
     if not len(points):
         return points
     cells = np.floor(points[:, :2] / CELL).astype(np.int64)
-    order = np.lexsort((points[:, 2], cells[:, 1], cells[:, 0]))
+    order = np.array(np.lexsort((points[:, 2], cells[:, 1], cells[:, 0])))
     cells = cells[order]
     first = np.concatenate(([True], (cells[1:] != cells[:-1]).any(1)))
     return points[order[first]]
@@ -61,13 +64,13 @@ def _lowest_of_cells(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, 
 
 def _plane(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
     """The plane through most of the low cells, at every cell: a street that climbs must not look like a step."""
-    x, y = (axis.astype(np.float64) for axis in np.indices(heights.shape))
+    x, y = np.indices(heights.shape, np.float64)
     known = np.isfinite(heights)
-    table = np.stack((np.ones(known.sum()), x[known], y[known]), 1)
-    values, weights = heights[known], np.ones(known.sum())
+    table = np.stack((np.ones(int(known.sum())), x[known], y[known]), 1)
+    values, weights = heights[known], np.ones(len(table))
     for _ in range(8):
         root = np.sqrt(weights)
-        found = np.linalg.lstsq(table * root[:, None], values * root, rcond=None)[0]
+        found = np.asarray(np.linalg.lstsq(table * root[:, None], values * root, rcond=None)[0])
         error = values - table @ found
         # What stands lies above the road, and little lies below: errors above count less, and less the larger.
         weights = 1 / (1 + (error / np.where(error > 0, 0.2, 1.0)) ** 2)
@@ -75,8 +78,17 @@ def _plane(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
 
 
 def _without_what_stands(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
-    """Heights of all cells, those of walls, cars and cells without a return from the nearest of the road."""
+    """Heights of all cells, those of walls, cars and cells without a return from the nearest of the road.
+
+    A cell far below those around it, as a mirror in a wet road makes, would make these look as if they stood.
+    """
+    around = ndimage.percentile_filter(_filled(heights, np.isfinite(heights)), LOW_PERCENTILE, size=5)
+    heights = np.where(heights > around - STANDING_STEP, heights, np.nan)  # False for NaN
     lowest = ndimage.minimum_filter(np.where(np.isnan(heights), np.inf, heights), size=STANDING_SPAN)
-    road = heights < lowest + STANDING_STEP  # False for NaN
-    nearest = ndimage.distance_transform_edt(~road, return_distances=False, return_indices=True)
-    return ndimage.median_filter(heights[tuple(nearest)], size=5)
+    return ndimage.median_filter(_filled(heights, heights < lowest + STANDING_STEP), size=5)
+
+
+def _filled(heights: Float64[np.ndarray, "x y"], known: Bool[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
+    """Heights with those of the nearest known cell where it is not known."""
+    nearest = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
+    return heights[tuple(nearest)]

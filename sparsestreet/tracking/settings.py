@@ -47,11 +47,15 @@ class TrackingSettings:
     min_moving_share: float = 0.3
     """Of the returns in the boxes of an object, the least share that move: fewer do where leaves rustle."""
 
+    min_confidence: float = 0.2
+    """Least confidence, which is the product of the share of steps at which an object is seen, of the share of its
+    returns that move, and of n / (n + 2) with n returns a step."""
+
     def __post_init__(self) -> None:
         for name in (field.name for field in fields(self)):
             if not getattr(self, name) > 0:
                 raise ValueError(f"tracks found in lidar need a positive {name}, got {getattr(self, name)}")
-        for name in ("min_free_share", "min_moving_share", "behind_share", "cluster_gap_share"):
+        for name in ("min_free_share", "min_moving_share", "min_confidence", "behind_share", "cluster_gap_share"):
             if getattr(self, name) > 1:
                 raise ValueError(f"tracks found in lidar need a {name} of at most 1, got {getattr(self, name)}")
         if self.highest <= self.lowest:
