@@ -181,7 +181,7 @@ def _tile(log: "DrivingLog", each: "FoundObject", track: "Track") -> "Tile | Non
     if best is None:
         return None
     place, corners = best
-    pixels = (255 * log.frames[place].image).round().byte().numpy()
+    pixels = log.frames[place].image.numpy()
     frame, camera = log.views[place].indices
     name = log.camera_names[camera] if log.camera_names else str(camera)
     return Tile(f"{track.name}, {each.kind}: frame {frame}, camera {name}", box_in_image(pixels, corners, each.kind))
