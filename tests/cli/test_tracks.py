@@ -19,6 +19,7 @@ from sparsestreet.cli.runs.run import data_of, found_classes
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.drivestudio.annotations import role_of
+from sparsestreet.pictures import from_above
 from sparsestreet.records.run import RUN
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.tracking import street
@@ -122,7 +123,12 @@ def test_thresholds_in_conf_are_those_of_the_class():
     assert said.keys() - {"_target_"} == set(TrackingSettings.__dataclass_fields__)
 
 
-def test_the_command_writes_boxes_that_our_reader_finds_and_keeps_its_answer(bare, finder, tmp_path, capsys):
+def test_the_command_writes_boxes_that_our_reader_finds_and_keeps_its_answer(
+    bare, finder, tmp_path, capsys, monkeypatch
+):
+    shown: list[np.ndarray] = []
+    whole = from_above.box_in_image
+    monkeypatch.setattr(from_above, "box_in_image", lambda image, *rest: shown.append(image) or whole(image, *rest))
     root, to = Path(bare[1].partition("=")[2]), tmp_path / "out"
     words = ["tracks", str(root), f"to={to}", f"cache={tmp_path / 'kept'}"]
     assert data(words) == 0
@@ -138,6 +144,9 @@ def test_the_command_writes_boxes_that_our_reader_finds_and_keeps_its_answer(bar
     assert len(finder.shown) == 1
     os.symlink(to / "instances", root / "instances")
     log = DriveStudioReader(root).read()
+    images = [frame.image.numpy() for frame in log.frames]
+    assert all(any(np.array_equal(one, image) for image in images) for one in shown)
+    assert len(shown) > len(finder.objects) / 2
     for track, each in zip(log.tracks, finder.objects, strict=True):
         assert role_of(track.class_name) == each.kind
         assert track.frames.tolist() == each.frames.tolist()
