@@ -48,7 +48,7 @@ def main(folder: Path) -> None:
         track = tracks.setdefault(name, {"name": name, "class": kind, "size": [float(s) for s in size], "at": []})
         box = vehicles[number[stamp]] @ pose(x, y, z, Rotation.from_euler("z", float(yaw)))
         track["at"].append({"frame": number[stamp], "world_from_box": box.tolist()})
-    rig = {"cameras": cameras, "frames": frames, "boxes": list(tracks.values())}
+    rig = {"cameras": cameras, "frames": frames} | ({"boxes": list(tracks.values())} if tracks else {})
     (folder / "rig.json").write_text(json.dumps(rig | {"lidar": {"vehicle_from_lidar": np.eye(4).tolist()}}))
     found = f"frames: {len(frames)}, cameras: {len(cameras)}, tracks of boxes: {len(tracks)}"
     print(f"{folder / 'rig.json'}: {found}; now sparsestreet data check {shlex.quote(str(folder))}")

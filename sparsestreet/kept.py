@@ -58,8 +58,10 @@ class Kept:
         """Names of those that were computed."""
 
     def within(self, *said: object) -> "Kept":
-        """The same folder, for answers that depend on more."""
-        return Kept(self._folder, *self._said, *said)
+        """The same folder, for answers that depend on more; it goes on counting what was found and made."""
+        within = Kept(self._folder, *self._said, *said)
+        within.found, within.made = self.found, self.made
+        return within
 
     def get(self, name: str, said: object, make: Callable[[], Value], *kinds: type) -> Value:
         """Return the answer of ``make``: from its file, or computed and written there.

@@ -203,6 +203,8 @@ class Sweep:
     """Since the first stamp of the log; None: the log has no clock."""
     stamp: int | None = None
     """Nanoseconds on the log's own clock; None: it has none."""
+    origin: Float64[Tensor, "3"] | None = None
+    """Where its lidar stood, of several the one with the most returns; world, meters. None: the log does not tell."""
 
     def __post_init__(self) -> None:
         _check_times(self.time, self.seconds)
@@ -260,6 +262,8 @@ class Track:
     span: tuple[float, float] | None = None
     """Normalized times of the first and last image or box of the annotated frames, between which it is there; None:
     from the first box to the last."""
+    found: bool = False
+    """Whether nobody annotated it: its boxes are those of a smooth path through its lidar returns, which may drift."""
 
     def __post_init__(self) -> None:
         what, poses = f"object {self.name} ({self.class_name})", self.world_from_object

@@ -101,9 +101,9 @@ class DrivingLog:
     sparse_points: Callable[[], SparsePoints] | None = None
     """Reads points that came with the log, where it has any. Gaussians start from them, and without lidar the scene's
     box lies around them; they are no returns, so they give no depth."""
-    carried_without: Callable[[frozenset[int]], tuple[Frames, Sweeps]] | None = None
-    """Makes frames and sweeps of which those of other instants depend on no box of the given ones; None: none depends
-    on a box of another instant anyway."""
+    carried_by: Callable[[Sequence[Track], frozenset[int]], tuple[Frames, Sweeps]] | None = None
+    """Makes frames and sweeps whose points these objects carry from one time to another; those of instants that are not
+    held out depend on no box of one that is. None: no box carries a point."""
 
     vehicle: VehiclePath | None = None
     """None: the log tells where its cameras were, but not the car that carried them."""
@@ -122,10 +122,27 @@ class DrivingLog:
         Images are taken at other times than sweeps, and a box on the way to the next one carries returns from one time
         to the other (``geometry.boxes.box_at``).
         """
-        if self.carried_without is None or not frames:
+        if self.carried_by is None or not frames:
             return self
-        kept, sweeps = self.carried_without(frames)
+        kept, sweeps = self.carried_by(self.tracks, frames)
         return replace(self, frames=kept, sweeps=sweeps)
+
+    def with_tracks(self, tracks: Sequence[Track]) -> "DrivingLog":
+        """The log with these objects in the place of its own: they carry its returns, and have answers of their own.
+
+        Raises ValueError where two have one name.
+        """
+        notes = tuple(note for note in self.notes if not tracks or note != _ABSENT["boxes"])
+        others = replace(self, tracks=tuple(tracks), notes=notes, kept=self.kept.within("tracks", tracks))
+        if self.carried_by is None:
+            return others
+        frames, sweeps = self.carried_by(tracks, frozenset())
+        return replace(others, frames=frames, sweeps=sweeps)
+
+    @property
+    def is_annotated(self) -> bool:
+        """Whether somebody has looked for objects in it, though there may be none."""
+        return _ABSENT["boxes"] not in self.notes
 
     hoods: Mapping[int, Hood] = field(default_factory=dict)
     """Camera index -> what it was found to see of the car that carries it (``hood.find_hoods``)."""

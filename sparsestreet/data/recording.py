@@ -59,6 +59,7 @@ class SceneFolder:
         check: Callable[[], list[Problem]],
         tracks: Sequence[Track] = (),
         sweep_stamps: Mapping[int, int] | None = None,
+        origins: Callable[[int], Float64[Tensor, "3"] | None] = lambda index: None,
     ) -> None:
         """
         Args:
@@ -70,6 +71,7 @@ class SceneFolder:
             check: finds everything that is wrong with the folder; it is asked once something is.
             tracks: objects that carry points, with the times of their boxes.
             sweep_stamps: frame index -> stamp of its sweep, where that is not the frame's.
+            origins: where the lidar of a frame index stood, in the log's world; None: nobody knows.
         """
         self._cache_bytes = cache_bytes
         self._views: dict[int, list[View]] = {}
@@ -77,24 +79,24 @@ class SceneFolder:
             self._views.setdefault(view.indices[0], []).append(view)
         self._read_pixels = read_frame
         self._clock = clock
-        self._tracks = tuple(tracks)
         self._sweep_stamps = sweep_stamps or {}
         self._check = check
         self._read_points = read_points
+        self._origins = origins
         self._use(tracks, frozenset())
 
-    def _use(self, others: Sequence[Track], held_out: frozenset[int]) -> None:
-        """Set the objects that carry points of frames which are not held out, and forgets what others carried."""
-        self._others, self._held_out = tuple(others), held_out
+    def _use(self, tracks: Sequence[Track], held_out: frozenset[int]) -> None:
+        """Set the objects that carry points, and forgets what others carried."""
+        self._tracks, self._others, self._held_out = tuple(tracks), without_frames(tracks, held_out), held_out
         self._frames = FrameCache(self._read_frame, self._cache_bytes)
         # The cameras of one instant are mostly asked for in a row, and look at the same points.
         read = self._read_points
         self._points = None if read is None else lru_cache(maxsize=1)(self._carried(read))
 
-    def holding_out(self, frames: frozenset[int]) -> tuple[Frames, Sweeps]:
-        """Frames and sweeps, of which those of other instants depend on no box of these frames."""
+    def carried_by(self, tracks: Sequence[Track], held_out: frozenset[int]) -> tuple[Frames, Sweeps]:
+        """Frames and sweeps whose points these objects carry; those of other instants depend on no box held out."""
         other = copy(self)
-        other._use(without_frames(self._tracks, frames), frames)
+        other._use(tracks, held_out)
         return other.frames, other.sweeps
 
     @property
@@ -158,7 +160,9 @@ class SceneFolder:
         return self._timed(points, torch.full_like(points.points, 0.5), seen)
 
     def _timed(self, points: CarriedPoints, colors: Float[Tensor, "n 3"], colored: Bool[Tensor, " n"]) -> Sweep:
-        return Sweep(points.frame, points.time, points.points, colors, colored, *self._moment(points.frame))
+        index = points.frame
+        moment, origin = self._moment(index), self._origins(index)
+        return Sweep(index, points.time, points.points, colors, colored, *moment, origin)
 
     def _moment(self, index: int) -> tuple[float | None, int | None]:
         """Seconds and stamp of a sweep."""
@@ -173,6 +177,8 @@ class LidarSweep:
     """Points in the data set's own world, meters, the sensor's motion taken out. Raises LogError for broken files."""
     stamp: int | None = None
     """Nanoseconds at which the points are where they are."""
+    origin: Float64[Tensor, "3"] | None = None
+    """Where the lidar stood then (of several: the main one), in the data set's own world; None: it is not told."""
 
 
 @dataclass(frozen=True)
@@ -343,6 +349,7 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
         check=check,
         tracks=tracks,
         sweep_stamps=_sweep_stamps(recording, num_frames),
+        origins=partial(_origin, recording.sweeps or {}, origin),
     )
     return DrivingLog(
         name=recording.name,
@@ -353,7 +360,7 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
         num_cameras=len(recording.rig),
         camera_names=tuple(str(camera.name) for camera in recording.rig),
         dataset_from_world=dataset_from_world(origin),
-        carried_without=folder.holding_out,
+        carried_by=folder.carried_by,
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
         vehicle=_vehicle(recording.vehicle, origin),
         notes=(
@@ -457,6 +464,11 @@ def _points(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], inde
     if index not in sweeps:
         return torch.zeros(0, 3)
     return (sweeps[index].read() - origin).float()
+
+
+def _origin(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], index: int) -> Float64[Tensor, "3"] | None:
+    stood = sweeps[index].origin if index in sweeps else None
+    return None if stood is None else stood - origin
 
 
 def _sparse_points(recording: Recording, origin: Float64[Tensor, "3"]) -> SparsePoints:

@@ -105,7 +105,15 @@ def timed_tracks(
 def _timed(track: Track, clock: LogClock, seen: Mapping[int, Sequence[float]], stamps: Sequence[int] | None) -> Track:
     frames = track.frames.tolist()
     own = [None] * len(frames) if stamps is None else stamps
-    times = [clock.time(frame, stamp) for frame, stamp in zip(frames, own, strict=True)]
+    return with_times(track, [clock.time(frame, stamp) for frame, stamp in zip(frames, own, strict=True)], seen)
+
+
+def with_times(track: Track, times: Sequence[float], seen: Mapping[int, Sequence[float]]) -> Track:
+    """Return the track with the normalized times of its boxes, and the span that follows.
+
+    ``seen``: frame -> normalized times of its images.
+    """
+    frames = track.frames.tolist()
     first, last = min((times[0], *seen.get(frames[0], ()))), max((times[-1], *seen.get(frames[-1], ())))
     return replace(track, times=torch.tensor(times, dtype=torch.float64), span=(first, last))
 

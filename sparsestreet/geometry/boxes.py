@@ -125,17 +125,17 @@ class CarriedPoints:
 
     def at(self, time: float) -> Float[Tensor, "n 3"]:
         """Return the points where they are at another time of the frame; at their own time this costs nothing."""
-        if time == self.time or not self._riders:
+        if time == self.time or not self.riders:
             return self.points
         moved = self.points.clone()
-        for track, rows, in_box in self._riders:
+        for track, rows, in_box in self.riders:
             world_from_box = box_at(track, self.frame, time)
             if world_from_box is not None:
                 moved[rows] = transform_points(world_from_box, in_box).to(moved.dtype)
         return moved
 
     @cached_property
-    def _riders(self) -> list[tuple[Track, Int[Tensor, " k"], Float64[Tensor, "k 3"]]]:
+    def riders(self) -> list[tuple[Track, Int[Tensor, " k"], Float64[Tensor, "k 3"]]]:
         """Each track that carries points: their rows, and where they are in its box."""
         found = []
         for track in self.tracks:

@@ -1,4 +1,4 @@
-"""``sparsestreet data``: logs are checked, converted and made."""
+"""``sparsestreet data``: logs are checked, converted and made, and their objects found."""
 
 import sys
 from collections.abc import Sequence
@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from sparsestreet.cli.commands.options import shown
+from sparsestreet.cli.commands.tracks import tracks
 from sparsestreet.cli.config.log_from_options import UsageError, compose_data, configured_log, reader_of
 from sparsestreet.cli.config.validate import type_problem
 from sparsestreet.data.check import report_check
@@ -131,6 +132,9 @@ sparsestreet data convert from=DIR to=DIR [data=... jpeg_quality=95 flavor=auto 
       sparsestreet data convert data=synthetic seed=3 to=street
 sparsestreet data make [seed=N] [data.log.settings.width=W ...]
     write a synthetic street, and print where it lies
+sparsestreet data tracks DIR [data=... tracks.settings.min_moved=2.0 tracks.join=true to=DIR ...]
+    find what moves in the lidar of a log, annotated or not: a table, boxes in DriveStudio's layout, a map from above
+    and a sheet of images, in DIR (outputs/tracks/LOG); the same command again takes the answer that is kept
 """
 
 
@@ -140,13 +144,13 @@ _NO_CHECKED = "no log is named: say sparsestreet data check DIR, DIR being the f
 def data(arguments: list[str]) -> int:
     """Run the sub-command; 2 on wrong usage."""
     verb, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
-    if verb not in ("check", "convert", "make") or "--help" in rest:
+    if verb not in ("check", "convert", "make", "tracks") or "--help" in rest:
         print(USAGE)
         return 0 if verb in ("-h", "--help") or "--help" in rest else 2
     if verb == "convert":
         return convert(rest)
     try:
-        return _check(rest) if verb == "check" else _make(rest)
+        return {"check": _check, "make": _make, "tracks": tracks}[verb](rest)
     except BrokenPipeError:
         raise  # somebody reads no more of our output
     except (ValueError, OSError) as error:

@@ -115,6 +115,7 @@ class TrainSchema:
     sparsify: Tree = MISSING
     node: Tree = MISSING
     effects: Tree | None = None
+    tracks: Tree = MISSING
     image_points: Any = None
     moved_views: Any = None
     loss: Tree = MISSING

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
@@ -21,11 +21,15 @@ from sparsestreet.cli.process import is_worker_rank, keep_freed_memory
 from sparsestreet.cli.runs.folder import lies_in, moments_to_keep, start_from_trunk, start_of, take_folder
 from sparsestreet.cli.runs.locks import devices_of_job
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.log import DrivingLog, split
 from sparsestreet.evaluation.speed import forget_peaks
 from sparsestreet.kept import Kept
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.rendering import RenderOptions
+from sparsestreet.tracking.objects import Kind
+from sparsestreet.tracking.settings import TrackingSettings
+from sparsestreet.tracking.street import found_tracks, joined
 from sparsestreet.training.callbacks import PhaseTimes
 from sparsestreet.training.recipe import Recipe, RunIdentity
 from sparsestreet.training.run import build, fit, train
@@ -67,8 +71,51 @@ def data_of(cfg: DictConfig) -> StreetData:
     log = reader.read()
     if (identity := reader.identity()) is not None:
         log = replace(log, kept=Kept(cfg.get("cache"), identity))
+    log = _with_tracks(cfg, log)
     # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
     return StreetData(log, **cfg.split, seed=cfg.seed, hood=_masked_from(cfg, "hood"), dirt=_masked_from(cfg, "dirt"))
+
+
+def _with_tracks(cfg: DictConfig, log: DrivingLog) -> DrivingLog:
+    """The log with the objects that the configuration asks for (conf/tracks).
+
+    Raises ValueError where they are to be found, and there is no lidar, or a kind of them has no class.
+    """
+    asked = cfg.get("tracks") or {"name": "log"}  # runs of earlier versions do not say
+    name = asked["name"]
+    if name == "log" and not log.is_annotated and len(log.sweeps) and _has_objects(cfg):
+        said = "%s has no boxes: objects are found in its lidar (tracks=found; tracks=none goes without)"
+        logging.getLogger(__name__).info(said, log.name)
+        name = "found"
+    if name == "log":
+        return log
+    if name == "none":
+        return log.with_tracks(())
+    settings = instantiate(asked["settings"]) if "settings" in asked else TrackingSettings()
+    parts = split(log, stride=cfg.split.stride, offset=cfg.split.offset, cameras=cfg.split.cameras)
+    found = found_tracks(log, settings, parts.held_out_indices, found_classes(cfg))
+    return log.with_tracks(joined(log.tracks, found) if joins(cfg) else found)
+
+
+def joins(cfg: DictConfig) -> bool:
+    """Whether found objects join the log's own. Raises ValueError for what is neither true nor false."""
+    join = (cfg.get("tracks") or {}).get("join", False)
+    if not isinstance(join, bool):
+        raise ValueError(f"tracks.join is true or false, got {join!r}")
+    return join
+
+
+def _has_objects(cfg: DictConfig) -> bool:
+    """Whether some node takes objects of a class."""
+    return any(node.get("classes") for node in cfg.node.values())
+
+
+def found_classes(cfg: DictConfig) -> dict[str, str]:
+    """Kind of a found object -> the first class of the log that data.classes has for it. Raises ValueError for none."""
+    for kind in (kinds := get_args(Kind)):
+        if not cfg.data.classes.get(kind):
+            raise ValueError(f"a found {kind} needs a class: name one, data.classes.{kind}=[{kind}]")
+    return {kind: cfg.data.classes[kind][0] for kind in kinds}
 
 
 def _masked_from(cfg: DictConfig, name: str) -> float | None:

@@ -307,6 +307,24 @@ def read_sweep(layout: Layout, frame: int, ahead: Sequence[float | int] | None =
     return transform_points(read_pose(layout.sweep_pose(frame)), points)
 
 
+def sweep_origin(layout: Layout, origin: Float64[Tensor, "3"], index: int) -> Float64[Tensor, "3"] | None:
+    """Where the lidar of a frame of the window stood, in the re-centered world.
+
+    Waymo's rows begin there (of several lidars: the median row's); points of nuScenes are in its own frame. None: other
+    flavors do not tell.
+    """
+    frame, flavor = layout.frames[index], layout.flavor.name
+    if flavor not in ("waymo", "nuscenes"):
+        return None
+    stood = torch.zeros(1, 3, dtype=torch.float64)
+    if flavor == "waymo":
+        points, rays = _read_rows(layout, frame)
+        if not len(points):
+            return None
+        stood = (points - rays).median(dim=0).values[None]
+    return transform_points(read_pose(layout.sweep_pose(frame)), stood)[0] - origin
+
+
 def sweep_notes(layout: Layout) -> list[str]:
     """What is said about points that are no returns."""
     frames = {layout.sweep(frame): frame for frame in layout.frames} if layout.has_lidar else {}

@@ -30,6 +30,7 @@ from sparsestreet.data.drivestudio.contents import (
     read_views,
     required_files,
     sweep_notes,
+    sweep_origin,
 )
 from sparsestreet.data.drivestudio.layout import FOLDER_KINDS, FlavorName, Layout, find_layout
 from sparsestreet.data.frame_cache import CacheSize, cache_bytes
@@ -184,6 +185,7 @@ class DriveStudioReader(LogReader):
             cache_bytes=cache_bytes(self.cache_mb),
             check=lambda: check_layout(layout, contents=True),
             tracks=tracks,
+            origins=partial(sweep_origin, layout, origin),
         )
         return DrivingLog(
             name=layout.root.resolve().name,
@@ -194,7 +196,7 @@ class DriveStudioReader(LogReader):
             num_cameras=len(rig),
             camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
-            carried_without=folder.holding_out,
+            carried_by=folder.carried_by,
             notes=(
                 *_notes(layout),
                 *self._without_effect(layout),

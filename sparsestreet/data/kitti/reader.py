@@ -327,7 +327,11 @@ def _shots(drive: Drive, parts: _Parts) -> list[RecordedImage]:
 
 def _sweeps(drive: Drive, parts: _Parts) -> dict[int, LidarSweep]:
     return {
-        place: LidarSweep(partial(_read_sweep, drive, parts, place), parts.clock.stamps[place])
+        place: LidarSweep(
+            partial(_read_sweep, drive, parts, place),
+            parts.clock.stamps[place],
+            (parts.poses[frame] @ parts.calibration.imu_from_lidar)[:3, 3],
+        )
         for place, frame in enumerate(drive.frames)
         if frame in parts.turns
     }

@@ -230,8 +230,9 @@ def _shots(sequence: SequenceFolders, parts: _Parts) -> list[RecordedImage]:
 
 
 def _sweeps(sequence: SequenceFolders, parts: _Parts) -> dict[int, LidarSweep]:
+    poses = parts.path.at(torch.tensor(parts.stamps)) @ parts.calibration.imu_from_lidar
     return {
-        place: LidarSweep(partial(_read_sweep, sequence, parts, place), parts.stamps[place])
+        place: LidarSweep(partial(_read_sweep, sequence, parts, place), parts.stamps[place], poses[place, :3, 3])
         for place, frame in enumerate(parts.frames)
         if sequence.sweep(frame).is_file()
     }

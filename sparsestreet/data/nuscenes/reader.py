@@ -266,8 +266,9 @@ class NuScenesReader(RecordedReader):
         chosen = self._selection
         if not self.lidar or LIDAR not in chosen.scene.files:
             return None
+        poses = {frame: chosen.world_from_sensor(file) for frame, file in chosen.sweeps.items()}
         return {
-            frame: LidarSweep(partial(read_sweep, file.path, chosen.world_from_sensor(file)), file.stamp)
+            frame: LidarSweep(partial(read_sweep, file.path, poses[frame]), file.stamp, poses[frame][:3, 3])
             for frame, file in chosen.sweeps.items()
         }
 

@@ -235,11 +235,11 @@ class PandaSetReader(RecordedReader):
         if absent := missing_files(paths):
             raise LogError(absent)
         sweeps = {
-            index: LidarSweep(partial(_points, path, world_from_lidar[index]), stamps[index])
-            for index, path in enumerate(paths)
+            index: LidarSweep(partial(_points, path, pose), stamps[index], pose[:3, 3])
+            for index, (path, pose) in enumerate(zip(paths, world_from_lidar, strict=True))
         }
         first = read_returns(paths[0], world_from_lidar[0])
-        sweeps[0] = LidarSweep(lambda: first.world, stamps[0])
+        sweeps[0] = LidarSweep(lambda: first.world, stamps[0], world_from_lidar[0, :3, 3])
         local = first.local.numpy()[first.spinning]
         seconds = first.seconds[first.spinning] - stamps[0] / PER_SECOND
         return sweeps, spin_of(np.arctan2(local[:, 1], local[:, 0]), seconds, _PERIOD)

@@ -174,7 +174,8 @@ class Part:
                 stamp = frame.stamp if frame.sweep_stamp is None else frame.sweep_stamp
                 reference = near[index] if frame.world_from_vehicle is None else frame.world_from_vehicle[:3, 3]
                 read = partial(read_sweep, frame.sweep, frame, self.table.lidar, drive, reference)
-                sweeps[index] = LidarSweep(read, stamp)
+                stood = _stood(frame, self.table.lidar.vehicle_from_lidar, stamp, drive)
+                sweeps[index] = LidarSweep(read, stamp, stood)
         return sweeps
 
     def boxes(self) -> list[Boxes] | None:
@@ -240,6 +241,19 @@ def _drive(frames: Sequence[FrameEntry]) -> PosePath | None:
     stamps = [stamp for stamp, _ in known]
     step = (stamps[-1] - stamps[0]) // max(len(stamps) - 1, 1)
     return PosePath(torch.tensor(stamps), torch.stack([pose for _, pose in known]), max_extrapolation=step)
+
+
+def _stood(
+    frame: FrameEntry, mount: Float64[Tensor, "4 4"] | None, stamp: int | None, drive: PosePath | None
+) -> Float64[Tensor, "3"] | None:
+    """Where the lidar was at the stamp of its sweep; None where points are the world's, or the drive does not reach."""
+    vehicle = frame.world_from_vehicle
+    if stamp is not None and drive is not None:
+        try:
+            vehicle = drive.at(torch.tensor([stamp]))[0]
+        except ValueError:  # said when the sweep is read
+            return None
+    return None if mount is None or vehicle is None else (vehicle @ mount)[:3, 3]
 
 
 def _read_masks(table: RigTable, pixels: Pixels, shot: RecordedImage) -> dict[str, Bool[Tensor, "h w"]]:

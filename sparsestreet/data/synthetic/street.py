@@ -7,7 +7,7 @@ import os
 import shutil
 import uuid
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from sparsestreet.data.synthetic.textures import stream
 from sparsestreet.data.synthetic.tracer import Point, Pose, at
 from sparsestreet.data.synthetic.world import Actor, World, build_world
 from sparsestreet.geometry.skeleton import JOINTS, NUM_JOINTS, rest_joints
-from sparsestreet.types import Shutter, View
+from sparsestreet.types import Shutter, Track, View
 
 
 def noisy_camera(settings: StreetSettings, world_from_camera: Pose, frame: int, camera: int) -> Pose:
@@ -171,11 +171,11 @@ def with_declared(log: DrivingLog, settings: StreetSettings, root: Path) -> Driv
     def all_told(frames: Frames) -> Frames:
         return Frames(map(told, frames.views), lambda view: told(frames.load(view)))
 
-    def carried_without(held_out: frozenset[int]) -> tuple[Frames, Sweeps]:
-        kept = log.holding_out(held_out)
+    def carried_by(tracks: Sequence[Track], held_out: frozenset[int]) -> tuple[Frames, Sweeps]:
+        kept = log.with_tracks(tracks).holding_out(held_out)
         return all_told(kept.frames), kept.sweeps
 
-    return replace(log, frames=all_told(log.frames), carried_without=carried_without)
+    return replace(log, frames=all_told(log.frames), carried_by=carried_by)
 
 
 def _motion(settings: StreetSettings, world: World, frame: int, camera: int) -> list[float]:

@@ -314,8 +314,13 @@ class WaymoReader(RecordedReader):
 
     def _sweeps(self) -> dict[int, LidarSweep] | None:
         segment, frames, spool = self._segment, self._frames, Spool()
+        top = segment.lidars.get("TOP")
         found = {
-            index: LidarSweep(partial(_read_points, segment, spool, frame), _instant(segment, frame))
+            index: LidarSweep(
+                partial(_read_points, segment, spool, frame),
+                _instant(segment, frame),
+                None if top is None else (segment.world_from_vehicle(frame) @ top.vehicle_from_lidar)[:3, 3],
+            )
             for index, frame in enumerate(frames)
             if segment.has_returns(frame)
         }

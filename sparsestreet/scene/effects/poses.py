@@ -367,7 +367,8 @@ def _torque(products: Float[Tensor, "4 4"]) -> Float[Tensor, "3"]:
 
 @dataclass(frozen=True, kw_only=True)
 class BoxPosesSettings(PartlessSettings):
-    """Called for where boxes of moving objects tremble. The rates of the corrections are those of the nodes.
+    """Called for where boxes of moving objects tremble, or were found in lidar: paths of these are smooth, and drift.
+    The rates of the corrections are those of the nodes.
 
     Raises ValueError for a negative threshold.
     """
@@ -386,6 +387,9 @@ class BoxPosesSettings(PartlessSettings):
 
     def detect(self, data: TrainingData) -> Finding:
         moving = [track for track in data.log.tracks if displacement(track) > _MOVES]
+        if drifting := sum(track.found for track in moving):
+            reason = f"{drifting} moving objects are found, not annotated: boxes on smooth paths, which may drift"
+            return Finding(called_for=True, reason=reason, unit="cm", threshold=self.threshold)
         found = box_jitter(moving, data.held_out)
         if found is None:
             # Two boxes tell no error from motion, and what boxes do at 2 frames a second is not known either.

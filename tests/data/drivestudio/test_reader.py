@@ -24,6 +24,7 @@ from tests.data.drivestudio.folders import (
     POINTS_IN_WORLD,
     STEP,
     WIDTH,
+    make_mounted_opencv,
     make_nuscenes,
     make_waymo,
     pose,
@@ -85,6 +86,23 @@ def test_a_point_straight_ahead_lands_in_the_image_center(make, tmp_path):
         assert inside.all()
         assert torch.allclose(pixels, torch.tensor([WIDTH / 2, HEIGHT / 2]), atol=1e-4)  # float32 of a 40 px image
         assert torch.allclose(depths, torch.tensor([10.0, 20.0]) - frame.frame_index, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("make", "stood"),
+    [(make_nuscenes, (0.0, 0.0, 1.8)), (make_waymo, (1.4, 0.0, 2.2)), (make_mounted_opencv, None)],
+    ids=["nuscenes", "waymo", "kitti"],
+)
+def test_where_the_lidar_stood_is_told_by_its_pose_or_by_its_rays(make, stood, tmp_path):
+    """The world of nuScenes begins at the first camera, 1.5 m above the ground; that of Waymo drives along y."""
+    log = DriveStudioReader(make(tmp_path)).read()
+    for sweep in log.sweeps:
+        if stood is None:
+            assert sweep.origin is None
+            continue
+        ahead, left, up = stood
+        wanted = (ahead + sweep.index, left, up - 1.5) if make is make_nuscenes else (-left, ahead + sweep.index, up)
+        assert there(sweep.origin).tolist() == pytest.approx(wanted, abs=1e-6)  # float32 rows
 
 
 @FLAVORS

@@ -82,6 +82,8 @@ def test_points_are_where_the_street_was(recording, shift):
         assert np.abs(points - wanted).max() < 2e-5
         still = moved(PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar, PLAN.sweep(frame)[0])
         assert np.abs(still + shift - wanted).max() > 0.4  # 10 m/s for half a turn of 0.1 s
+        stood = moved(PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar, np.zeros((1, 3)))[0]
+        assert np.abs(sweep.origin.numpy() - stood - shift).max() < POSITION
         assert sweep.stamp == PLAN.stamps[frame]
 
 

@@ -76,6 +76,8 @@ def test_points_are_where_the_street_was(recording):
         assert np.linalg.norm(points - wanted, axis=1).max() < bound + 2e-5
         still = moved(PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar, PLAN.sweep(frame)[0])
         assert np.abs(still - wanted).max() > 0.4
+        stood = PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar
+        assert np.abs(sweep.origin.numpy() - stood[:3, 3]).max() < POSITION
 
 
 def test_points_of_a_straight_drive_are_exact(tmp_path):

@@ -74,6 +74,8 @@ def test_returns_are_where_they_were_and_the_own_car_has_none(recording):
         points = sweep.read()
         # One return of the roof was written too. float32 has steps of 4e-6 m at 45 m.
         assert np.allclose(points, PLAN.world_points(frame), rtol=0, atol=1e-5)
+        stood = PLAN.world_from_vehicle(sweep_end(PLAN, frame)) @ PLAN.vehicle_from_lidar
+        assert np.allclose(there(sweep.origin), stood[:3, 3], rtol=0, atol=1e-6)
 
 
 def test_the_log_that_follows(drive):

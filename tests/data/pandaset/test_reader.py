@@ -52,6 +52,9 @@ def test_returns_stand_where_they_were_less_those_of_the_own_car(era, ending, tm
         np.testing.assert_array_equal(points, np.stack([columns[axis] for axis in "xyz"], -1)[:-1])
         np.testing.assert_array_equal(points[:-1], PLAN.world_points(frame))
         assert one.stamp == PLAN.stamps[frame]
+        stood = PLAN.world_from_vehicle(PLAN.stamps[frame]) @ PLAN.vehicle_from_lidar
+        # What the publisher says of where the front camera is on the lidar is rounded.
+        np.testing.assert_allclose(there(one.origin).numpy(), stood[:3, 3], rtol=0, atol=1e-3)
 
 
 def test_a_box_has_the_stamp_at_which_the_beam_passed_it(sequence):

@@ -67,6 +67,8 @@ def test_points_are_where_they_were(recording):
         assert sweep.stamp == PLAN.stamps[frame]
         still = in_lidar(PLAN, frame)
         assert np.abs(still - PLAN.sweep(frame)[0]).max() > 0.3  # what the car's motion would do
+        stood = PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar
+        assert np.abs(there(sweep.origin).numpy() - stood[:3, 3]).max() < 1e-9
 
 
 def test_boxes_are_where_they_were(recording, log):

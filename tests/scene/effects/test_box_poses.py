@@ -66,6 +66,19 @@ def test_it_is_called_for_where_boxes_tremble(meters: float, on: bool):
     assert found.value == pytest.approx(100 * meters * 3**0.5, rel=0.35)
 
 
+def test_it_is_called_for_where_boxes_were_found_because_these_drift_and_do_not_tremble():
+    still = replace(trembling(0.0), name="parked", world_from_object=torch.stack([pose(0.0, (9.0, 9.0, 0.0))] * 40))
+    for found, moving in ((True, False), (False, True), (True, True)):
+        cars = replace(trembling(0.0), found=moving), replace(still, found=found)
+        wanted = BoxPosesSettings().detect(training_data(replace(street_log(), tracks=cars)))
+        assert wanted.called_for == moving
+        assert ("1 moving objects are found, not annotated" in wanted.reason) == moving
+    data = training_data(replace(street_log(), tracks=cars))
+    for when in ("auto", "off"):
+        (plan,) = plan_effects({"boxes": BoxPosesSettings(when=when)}, data).effects
+        assert plan.on == (when == "auto")
+
+
 def test_too_few_boxes_are_corrected_as_nothing_says_that_they_are_right():
     found = BoxPosesSettings().detect(training_data())
     assert (found.called_for, found.value) == (True, None)
