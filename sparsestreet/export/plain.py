@@ -19,7 +19,7 @@ from sparsestreet.ops.reference import on_screen, visible_rows
 from sparsestreet.ops.reference.projection import COMPENSATION_FLOOR
 from sparsestreet.types import Camera, Gaussians, View
 
-MOST_CAMERAS = 36
+MAX_CAMERAS = 36
 """Cameras of a log that are asked, spread over its time."""
 
 
@@ -50,4 +50,4 @@ def plain_factors(
 
 def spread_cameras(views: Sequence[View]) -> list[Camera]:
     """Return cameras of some views, spread over all of them."""
-    return [views[place].camera for place in spread(len(views), MOST_CAMERAS)]
+    return [views[place].camera for place in spread(len(views), MAX_CAMERAS)]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from sparsestreet.export.plain import MOST_CAMERAS, plain_factors, spread_cameras
+from sparsestreet.export.plain import MAX_CAMERAS, plain_factors, spread_cameras
 from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.types import Camera, Gaussians, View
 
@@ -60,5 +60,5 @@ def test_without_antialias_nothing_changes():
 def test_cameras_are_spread_over_all_views(count):
     views = [View(ahead(float(place)), 0.0) for place in range(count)]
     places = [float(camera.camera_from_world[2, 3]) for camera in spread_cameras(views)]
-    assert len(places) == min(count, MOST_CAMERAS)
+    assert len(places) == min(count, MAX_CAMERAS)
     assert (places[0], places[-1]) == (0.0, float(count - 1))
