@@ -49,7 +49,7 @@ def test_three_runs_one_table_and_pictures(asked, monkeypatch, capsys):
     out, start = Path("outputs/demo"), [sys.executable, "-m", "sparsestreet", "train"]
     names = ("none", "paper_short", "removal")
     assert commands == [
-        [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=1000", "overwrite=true",
+        [*start, f"sparsify={name}", "assignment=all_rigid", "schedule.max_steps=800", "overwrite=true",
          "data.log.settings.width=240", "data.log.settings.height=144", "data.log.settings.num_frames=30",
          "data.log.settings.num_cameras=2", "capacity.background.max_gaussians=70000",
          f"out={out / name}", "seed=1", "schedule.max_steps=20"]

@@ -30,7 +30,7 @@ SPARSIFY = {"none": "plain", "paper_short": "the paper's method (short)", "remov
 """Sparsification -> what it is called where nobody has read the glossary."""
 ASSIGNMENT = "all_rigid"
 """Whoever walks or rides is on a track too, as a figure that keeps its shape: method=omnire takes longer."""
-STEPS = 1000
+STEPS = 800
 SMALL = [
     *(f"data.log.settings.{name}" for name in ("width=240", "height=144", "num_frames=30", "num_cameras=2")),
     "capacity.background.max_gaussians=70000",
