@@ -1,7 +1,7 @@
 """Clusters of successive instants that are one object: each is predicted at constant velocity."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -44,15 +44,13 @@ class Chain:
         return Chain(np.array(steps, np.int64), tuple(Returns.joined(parts[step]) for step in steps))
 
 
-@dataclass
 class _Open:
     """A chain that may go on."""
 
-    steps: list[int]
-    parts: list[Returns]
-    place: Float64[np.ndarray, "2"]
-    extent: float
-    velocity: Float64[np.ndarray, "2"] = field(default_factory=lambda: np.zeros(2))
+    def __init__(self, step: int, cluster: Cluster) -> None:
+        self.steps, self.parts = [step], [cluster.returns]
+        self.place, self.extent = cluster.middle, cluster.extent
+        self.velocity = np.zeros(2)
 
     def take(self, step: int, cluster: Cluster, passed: float) -> None:
         """Add a cluster, ``passed`` seconds after the last one: an alpha-beta filter whose gains fall with age."""
@@ -91,7 +89,7 @@ def associate(
                 chain = going[row]
                 chain.take(step, found[column], float(seconds[step] - seconds[chain.steps[-1]]))
                 taken.add(int(column))
-        going += [_Open([step], [c.returns], c.middle, c.extent) for k, c in enumerate(found) if k not in taken]
+        going += [_Open(step, cluster) for number, cluster in enumerate(found) if number not in taken]
         lost = [chain.lost(float(seconds[step] - seconds[chain.steps[-1]]), period) for chain in going]
         done += [chain for chain, gone in zip(going, lost, strict=True) if gone]
         going = [chain for chain, gone in zip(going, lost, strict=True) if not gone]

@@ -173,7 +173,7 @@ def test_the_loss_is_the_sum_of_what_applies_and_of_the_nodes_own_terms():
     for index, factor in ((1, 2.5), (0, 2.0)):
         frame = frame_at(index)
         loss = system.training_step(frame, 0)
-        mean = float(render(system.scene, frame, system.state()).rgb.detach().mean())
+        mean = float(render(system.scene, frame, system.state(), system.options).rgb.detach().mean())
         size = 0.25 * float(node.rows.log_scales.detach().sum())
         assert loss.item() == pytest.approx(factor * mean + size, rel=1e-5)
         said = system.said.newest

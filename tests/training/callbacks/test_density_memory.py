@@ -64,7 +64,9 @@ def test_what_fits_is_what_a_limit_would_allow(monkeypatch):
     strategy = GROWS_ALL
     limited = every_ten()
     monkeypatch.setattr(density_control, "bytes_for_growth", lambda device: float("inf"))
-    trainer, other, _ = started(limited, background=background(20, density=strategy, max_gaussians=26))
+    trainer, other, _ = started(
+        limited, background=background(20, density=strategy, max_gaussians=26, limit_rises=False)
+    )
     limited.statistics["background"].gradient_sum += 1 + torch.arange(20)
     limited.statistics["background"].visits += 1
     trainer.walk(10)

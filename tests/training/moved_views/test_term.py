@@ -55,7 +55,10 @@ def test_the_same_gaussians_from_elsewhere_are_those_of_a_view_there():
     pose[0, 3] = -0.7
     there = View(replace(frame.camera, camera_from_world=pose), frame.time, frame.frame_index, frame.camera_index)
     rendering = seen(one, frame)
-    again, anew = from_another_camera(one, rendering, there, rendering.options), render(one, there, rendering.state)
+    again, anew = (
+        from_another_camera(one, rendering, there, rendering.options),
+        render(one, there, rendering.state, rendering.options),
+    )
     assert torch.equal(again.rgb, anew.rgb)
     assert torch.equal(again.depth, anew.depth)
     assert not torch.equal(again.rgb, rendering.rgb)

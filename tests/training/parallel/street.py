@@ -56,7 +56,7 @@ def system() -> StreetSystem:
     torch.manual_seed(0)  # of the network of a mask
     density = GradientDensity(grad_threshold=2e-4)
     nodes = {
-        "road": background(40, density=density, mask=STATIC, max_gaussians=150, min_gaussians=20),
+        "road": background(40, density=density, mask=STATIC, max_gaussians=150, limit_rises=False, min_gaussians=20),
         "cars": rigid(20, density=Watching(grad_threshold=1e-4), mask=STATIC, min_gaussians=9, box_margin=10.0),
         "people": _masked_over_time(
             background(
@@ -64,6 +64,7 @@ def system() -> StreetSystem:
                 seed=5,
                 density=density,
                 max_gaussians=60,
+                limit_rises=False,
                 min_gaussians=10,
                 learning_rates=dict.fromkeys(("rows", "mask"), LearningRate(0.01)),
             )

@@ -13,6 +13,7 @@ from sparsestreet.pruning import LeaveOneOutRule, RenderContext
 from sparsestreet.ranks import ALONE, LostProcessError, Ranks
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.state import RenderOptions
 from sparsestreet.training.adam import RowAdam
 from sparsestreet.training.parallel import DisagreementError, check_agreement, checksum, exchange
 from tests.training.parallel.several import PATIENCE, several
@@ -55,12 +56,10 @@ def scene(difference: float = 0.0) -> SceneGraph:
 
 def scores(ranks: Ranks) -> dict[str, Tensor]:
     """What pruning decides from: costs of rows, and the floors of the objects, by all views."""
-    street, context = (
-        SceneGraph({"road": background(12), "cars": rigid(8, min_instance_gaussians=600.0)}),
-        RenderContext(),
-    )
+    street = SceneGraph({"road": background(12), "cars": rigid(8, min_instance_gaussians=600.0)})
     set_rows(street.nodes["cars"], "opacity_logits", {1: 9.0})
-    frames, context = [frame_at(index, 16 + 8 * index, 16) for index in range(5)], RenderContext(ranks=ranks)
+    frames = [frame_at(index, 16 + 8 * index, 16) for index in range(5)]
+    context = RenderContext(options=RenderOptions(), ranks=ranks)
     rule = LeaveOneOutRule(allowed_db=0.1)
     floors = rule.floors(street, frames, context)["cars"].instances
     assert floors is not None
