@@ -24,17 +24,15 @@ MAX_CAMERAS = 36
 
 
 @torch.no_grad()
-def plain_factors(
-    looks: Iterable[tuple[Gaussians, Sequence[Camera]]], settings: SplatSettings
-) -> Float[Tensor, " n"] | float:
+def plain_factors(looks: Iterable[tuple[Gaussians, Sequence[Camera]]], settings: SplatSettings) -> Float[Tensor, "..."]:
     """Return by what each row's opacity is multiplied for viewers that do not antialias; 1 for a row nobody sees.
 
     Args:
         looks: the same rows where they are at some time, meters in the world, and the cameras of then.
-        settings: those that the scene was trained with. Without antialias all factors are 1.
+        settings: those that the scene was trained with. Without antialias the one factor of all rows is 1.
     """
     if not settings.antialias:
-        return 1.0
+        return torch.ones(())
     total = count = torch.zeros(())
     for gaussians, cameras in looks:
         for camera in cameras:
