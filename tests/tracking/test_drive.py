@@ -1,9 +1,13 @@
 """What moves, what is not always there and what stands, on drives of few places that are counted by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sparsestreet.tracking.drive import Instant, gathered, look, moving_share
+from sparsestreet.tracking.extension import extended
+from sparsestreet.tracking.find import _is_object
 from sparsestreet.tracking.fit import Fit
 from sparsestreet.tracking.free_space import count_views
 from sparsestreet.tracking.ground import Ground
@@ -99,3 +103,40 @@ def test_the_share_that_moves_is_that_of_the_steps_at_which_it_goes():
     drive = [instant([False] * 4, [True, True, True, False]), instant([False] * 4, [False] * 4)]
     assert moving_share(object_of([5.0, 0.0]), drive, 0.4) == 0.75
     assert moving_share(object_of([0.0, 0.0]), drive, 0.4) == 0
+
+
+def driving(path: np.ndarray, size: tuple[float, float, float] = (4.0, 2.0, 1.5)) -> Fit:
+    """Heads along x at 10 m/s, with ten returns at each step of 0.1 s."""
+    count = len(path)
+    shape = Shape("vehicle", np.array(size), np.full(3, 0.1))
+    speed, counts = np.full(count, 10.0), np.full(count, 10, np.int64)
+    return Fit(np.arange(count), path, np.zeros(count), speed, np.zeros(count), shape, counts, 0.0)
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_an_object_is_followed_by_returns_that_are_not_always_there(leaves):
+    """It is seen at the first three of six steps, and goes on as it went; a wall in its way is not it."""
+    corners = np.array([[x, y, 1.0] for x in np.linspace(-1.9, 1.9, 6) for y in (-0.9, 0.9)])
+    drive = []
+    for step in range(6):
+        points = corners + np.array([1.0 * step, 0.0, 0.0])
+        flags = [np.full(len(points), leaves), np.full(len(points), leaves), np.full(len(points), not leaves)]
+        drive.append(Instant(Returns(points, np.tile((-20.0, 0.0, 1.8), (len(points), 1))), *flags))
+    path = np.column_stack((np.arange(3.0), np.zeros(3)))
+    chain = extended(driving(path), drive, 0.1 * np.arange(6), SETTINGS)
+    assert chain.steps.tolist() == ([3, 4, 5] if leaves else [])
+
+
+def test_an_object_goes_somewhere():
+    seconds = 0.1 * np.arange(9)
+    along = np.column_stack((np.arange(9.0), np.zeros(9)))
+    around = 2.2 * np.column_stack((np.sin(0.75 * np.arange(9.0)), np.cos(0.75 * np.arange(9.0))))
+    assert _is_object(driving(along), seconds, SETTINGS, 1.0)
+    assert not _is_object(driving(around), seconds, SETTINGS, 0.5)  # 0.6 m away after 13 m
+    assert not _is_object(driving(along), seconds, SETTINGS, 9.0)
+    assert not _is_object(driving(4 * along), seconds, SETTINGS, 1.0)  # 40 m/s
+    tall = replace(driving(along), shape=Shape("pedestrian", np.array([1.0, 1.0, 2.5]), np.full(3, 0.1)))
+    assert not _is_object(tall, seconds, SETTINGS, 1.0)
+    assert not _is_object(replace(driving(along), error=0.6), seconds, SETTINGS, 1.0)
+    rare = np.array([9, 0, 0, 9, 0, 0, 0, 0, 9])
+    assert not _is_object(replace(driving(along), counts=rare), seconds, SETTINGS, 1.0)

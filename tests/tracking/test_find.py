@@ -53,6 +53,7 @@ def test_a_car_that_passes_is_found_where_it_is():
     assert off[:, 3].max() < 2
     assert car.size == pytest.approx(CAR, abs=0.25)
     assert car.confidence > 0.7
+    assert found(scans, replace(SETTINGS, min_confidence=0.99)) == ()
 
 
 def test_the_world_may_be_turned_and_shifted():
