@@ -53,7 +53,9 @@ def test_a_car_that_passes_is_found_where_it_is():
     assert off[:, 3].max() < 2
     assert car.size == pytest.approx(CAR, abs=0.25)
     assert car.confidence > 0.7
-    assert found(scans, replace(SETTINGS, min_confidence=0.99)) == ()
+    above = float(np.nextafter(car.confidence, 2.0))
+    assert found(scans, replace(SETTINGS, min_confidence=above)) == ()
+    assert len(found(scans, replace(SETTINGS, min_confidence=car.confidence))) == 1
 
 
 def test_the_world_may_be_turned_and_shifted():
