@@ -324,3 +324,17 @@ def test_objects_that_cannot_be_are_refused(wrong, said):
     assert np.linalg.det(poses[0]) == pytest.approx(1)
     with pytest.raises(ValueError, match=said):
         FoundObject(**good | wrong)
+
+
+def cluster_at(x: float, extent: float) -> Cluster:
+    points = np.array([[x - extent / 2, 3.0, 1.0], [x + extent / 2, 3.0, 1.0]])
+    return Cluster(returns_of(points), np.array([x, 3.0]), extent)
+
+
+def test_a_chain_takes_what_is_as_large_and_may_grow_smaller_step_by_step():
+    seconds = 0.1 * np.arange(8)
+    sudden = [[cluster_at(0.5 * step, 4.0 if step < 4 else 0.3)] for step in range(8)]
+    assert [chain.steps.tolist() for chain in associate(sudden, seconds, SETTINGS)] == [[0, 1, 2, 3], [4, 5, 6, 7]]
+    # By a factor 0.8 each time, 0.2 in all, as of a car whose back alone is seen at last: exp(-1.2) is 0.3.
+    slow = [[cluster_at(0.5 * step, 5 * 0.8**step)] for step in range(8)]
+    assert [len(chain) for chain in associate(slow, seconds, SETTINGS)] == [8]
