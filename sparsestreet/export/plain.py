@@ -3,7 +3,7 @@
 A scene that was trained with antialias has small Gaussians whose opacity falls where the blur of the screen widens them
 (Mip-Splatting, Yu et al. 2024): by sqrt(det / det_blurred), which depends on the camera. Viewers of plain 3DGS blur
 without that factor, and would show far surfaces too thick and too bright. So a file for them holds opacities with the
-mean factor of the cameras that see a Gaussian. What the log's cameras saw is then 4 to 14 dB nearer to what training
+mean factor of the cameras that see a Gaussian. What the log's cameras saw is then 2 to 15 dB nearer to what training
 drew (docs/shipping.md).
 """
 

@@ -166,6 +166,16 @@ def test_its_parts_fit_together_and_are_no_others(preset: str, method: str):
     assert all(key.startswith(("preset.", "loss.")) for key in new)
 
 
+@pytest.mark.parametrize(("preset", "method"), PAIRS)
+@pytest.mark.parametrize("size", [FULL, ()], ids=["full", "short"])
+def test_masks_do_not_change_how_long_a_preset_grows(preset: str, method: str, size: tuple[str, ...]):
+    plain, masked = (
+        composed(f"preset={preset}", f"method={method}", f"sparsify={name}", *size) for name in ("none", "paper")
+    )
+    growth = masked.callback.density_control
+    assert (growth.densify_until, growth.refine_in) == (plain.schedule.densify_until, plain.schedule.refine_in)
+
+
 def test_a_method_without_a_configuration_is_refused_in_one_line():
     for method in ("3dgs", "deformgs", "pvg"):
         assert config_problem(composed("preset=drivestudio_legacy", f"method={method}")) == (

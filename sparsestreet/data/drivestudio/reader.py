@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import get_args
 
@@ -185,7 +185,7 @@ class DriveStudioReader(LogReader):
             cache_bytes=cache_bytes(self.cache_mb),
             check=lambda: check_layout(layout, contents=True),
             tracks=tracks,
-            origins=partial(sweep_origin, layout, origin),
+            origins=cache(partial(sweep_origin, layout, origin)),  # rows of Waymo are read for it
         )
         return DrivingLog(
             name=layout.root.resolve().name,
