@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import ModuleType
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -17,6 +18,7 @@ from torch.autograd.profiler_util import FunctionEvent
 from torch.profiler import DeviceType, ProfilerActivity, profile
 
 from benchmarks import gsplat_baseline
+from benchmarks.streets import front_streets
 from sparsestreet.bench.accuracy import Errors, agrees, answer, errors
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.scenes import BenchScene, Size, frustum_camera, frustum_gaussians
@@ -33,11 +35,11 @@ from sparsestreet.bench.timing import (
     time_once,
     work_of,
 )
-from sparsestreet.cli.commands.bench import record_file, scene_and_views, street_at
+from sparsestreet.cli.commands.bench import record_file
 from sparsestreet.cli.commands.options import run_command
-from sparsestreet.geometry.cameras import resized
 from sparsestreet.ops.backend import resolve_backend
 from sparsestreet.ops.cpu.library import find_library
+from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.splat import splat
 from sparsestreet.ops.ssim import ssim
 from sparsestreet.phases import clock_of
@@ -87,7 +89,7 @@ class GpuRecord:
 
 
 def line(record: GpuRecord) -> str:
-    """One row of the table: medians and inter-quartile ranges."""
+    """One row of the table: medians, and in parentheses the least."""
     start = f"{record.renderer:<23} {record.scene:<16}{record.rows:>9} {record.width}x{record.height:<6}"
     if record.forward is None or record.backward is None:
         return f"{start} FAILED: {record.failed}"
@@ -112,7 +114,8 @@ def line(record: GpuRecord) -> str:
 
 
 def _short(value: TimeSpread) -> str:
-    return f"{value.median:.3f}" + ("" if value.iqr is None else f" (iqr {value.iqr:.3f})")
+    """Median and least: the host's noise moves the first by up to 0.9 ms between two rows of a process."""
+    return f"{value.median:.3f}" + ("" if value.iqr is None else f" ({value.minimum:.3f})")
 
 
 Seen = Callable[[], tuple[Tensor, Tensor]]
@@ -123,11 +126,11 @@ SHARE = 0.2
 """Weight of D-SSIM in the loss (3DGS, eq. 7)."""
 
 
-def our_render(camera: Camera, backend: str) -> Render:
+def our_render(camera: Camera, settings: SplatSettings, backend: str) -> Render:
     """Renders with the op of this project."""
 
     def render(gaussians: Gaussians) -> tuple[Tensor, Seen]:
-        rendering = splat(gaussians, camera, settings=gsplat_baseline.SETTINGS, backend=backend)
+        rendering = splat(gaussians, camera, settings=settings, backend=backend)
         return rendering.rgb, lambda: (rendering.screen_gradients, rendering.radii)
 
     return render
@@ -336,6 +339,28 @@ class Workload:
         return self.rows.means.device
 
 
+Renderer = Literal["ours", "gsplat"]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Who is measured, and how."""
+
+    backend: str
+    """Of our op."""
+    peer: ModuleType | None
+    budget: TimingBudget
+    first: Renderer = "ours"
+    """Measured before the other at each size: caches, clocks and the allocator remember what ran last."""
+    compares: bool = True
+    """Whether images and gradients are compared, which takes longer than the times."""
+
+    @property
+    def settings(self) -> SplatSettings:
+        """Of our op: those that match the peer."""
+        return gsplat_baseline.settings_beside(self.peer)
+
+
 def run_gpu(
     sizes: Sequence[Size],
     device: torch.device,
@@ -343,12 +368,13 @@ def run_gpu(
     file: RecordFile,
     say: Callable[[str], None] = print,
     streets: Sequence[BenchScene] = (),
+    first: Renderer = "ours",
+    compares: bool = True,
 ) -> bool:
-    """Measures every size, and trained streets after the first; returns False if a renderer failed or gsplat
-        disagrees.
+    """Measures trained streets, then every size; returns False if a renderer failed or gsplat disagrees.
 
-    A failure does not stop the other measurements. gsplat runs in both of its modes at the first size, then in the
-        faster one. Each record is on disk as soon as it is measured.
+    A failure does not stop the other measurements. gsplat runs in both of its modes at first, then in the faster one.
+        Each record is on disk as soon as it is measured. ``first`` and ``compares`` as ``Comparison`` has them.
     """
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else "cpu: these are no GPU timings"
     backend, found = resolve_backend("auto", device), gsplat_baseline.find_gsplat(device)
@@ -357,53 +383,64 @@ def run_gpu(
         say("nothing is measured: the dense reference would take hours at these sizes; install triton")
         return False
     records: list[GpuRecord] = []
-    peer, modes = (None, ()) if isinstance(found, str) else (found, gsplat_baseline.MODES)
+    comparison = Comparison(backend, None if isinstance(found, str) else found, budget, first, compares)
+    modes: Sequence[str] = gsplat_baseline.MODES
     for workload in _workloads(sizes, streets, device):
-        for record in _measure_all(workload, name, backend, peer, modes, budget):
+        theirs: list[GpuRecord] = []
+        for record in _measure_all(workload, name, comparison, modes):
             file.write("gpu", record)
             say(line(record))
             records.append(record)
-        if len(modes) > 1:
-            modes = (min(zip(modes, records[-len(modes) :], strict=True), key=_milliseconds)[0],)
+            theirs += [record] if record.renderer.startswith("gsplat") else []
+        if len(theirs) > 1:
+            modes = (min(zip(modes, theirs, strict=True), key=_milliseconds)[0],)
     good = sum(record.ok for record in records)
     say(f"{good} of {len(records)} measured and in agreement")
     return good == len(records)
 
 
 def _workloads(sizes: Sequence[Size], streets: Sequence[BenchScene], device: torch.device) -> Iterator[Workload]:
-    for size in sizes[:1]:
-        yield Workload.random(size, device)
+    """Streets first: a time limit cuts off what comes last."""
     for street in streets:
         yield Workload.of(street, device)
-    for size in sizes[1:]:
+    for size in sizes:
         yield Workload.random(size, device)
 
 
-def _measure_all(
-    workload: Workload,
-    name: str,
-    backend: str,
-    peer: ModuleType | None,
-    modes: Sequence[str],
-    budget: TimingBudget,
+def _measure_all(workload: Workload, name: str, comparison: Comparison, modes: Sequence[str]) -> Iterator[GpuRecord]:
+    camera = workload.camera
+    blank = GpuRecord("", name, workload.scene, len(workload.rows), camera.width, camera.height)
+    comparison = replace(comparison, compares=comparison.compares and len(workload.rows) <= TRUTH_ROWS)
+    parts = [_measure_ours, *([] if comparison.peer is None else [_measure_theirs])]
+    for part in parts if comparison.first == "ours" else parts[::-1]:
+        yield from part(workload, blank, comparison, modes)
+
+
+def _measure_ours(
+    workload: Workload, blank: GpuRecord, comparison: Comparison, modes: Sequence[str]
 ) -> Iterator[GpuRecord]:
-    rows, camera = workload.rows, workload.camera
-    blank = GpuRecord("", name, workload.scene, len(rows), camera.width, camera.height)
-    is_compared = len(rows) <= TRUTH_ROWS
+    backend, settings, budget = comparison.backend, comparison.settings, comparison.budget
     record = replace(blank, renderer=f"sparsestreet {backend}")
-    record = _counted(measure(record, _ours(workload, backend), workload, budget), workload, backend)
-    record = stepped(record, our_render(camera, backend), workload, budget)
-    if is_compared and find_library() is not None:
-        record = compared(record, partial(_against_truth, workload, backend))
+    record = measure(record, _ours(workload, settings, backend), workload, budget)
+    record = _counted(record, workload, settings, backend)
+    record = stepped(record, our_render(workload.camera, settings, backend), workload, budget)
+    if comparison.compares and find_library() is not None:
+        record = compared(record, partial(_against_truth, workload, settings, backend))
     yield record
-    if peer is None:
-        return
+
+
+def _measure_theirs(
+    workload: Workload, blank: GpuRecord, comparison: Comparison, modes: Sequence[str]
+) -> Iterator[GpuRecord]:
+    peer, budget = comparison.peer, comparison.budget
+    assert peer is not None, "asked for where there is one"
     for mode in modes:
         record = replace(blank, renderer=f"gsplat {gsplat_baseline.version(peer)} {mode}")
         record = _listed(measure(record, _theirs(workload, peer, mode), workload, budget), workload, peer)
-        record = stepped(record, their_render(peer, camera, workload.device, mode), workload, budget)
-        if is_compared:
-            record = compared(record, partial(gsplat_baseline.parity, peer, workload.rows, workload.camera, backend))
+        record = stepped(record, their_render(peer, workload.camera, workload.device, mode), workload, budget)
+        if comparison.compares:
+            agreement = partial(gsplat_baseline.parity, peer, workload.rows, workload.camera, comparison.backend)
+            record = compared(record, agreement)
         yield record
 
 
@@ -414,10 +451,10 @@ def _milliseconds(measured: tuple[str, GpuRecord]) -> float:
     return record.forward.median + record.backward.median
 
 
-def _counted(record: GpuRecord, workload: Workload, backend: str) -> GpuRecord:
+def _counted(record: GpuRecord, workload: Workload, settings: SplatSettings, backend: str) -> GpuRecord:
     if record.failed is not None:
         return record
-    pairs, samples = work_of(workload.rows, workload.camera, gsplat_baseline.SETTINGS, backend)
+    pairs, samples = work_of(workload.rows, workload.camera, settings, backend)
     return replace(record, pairs=pairs, samples=samples)
 
 
@@ -432,9 +469,9 @@ def _listed(record: GpuRecord, workload: Workload, peer: ModuleType) -> GpuRecor
     return replace(record, pairs=pairs)
 
 
-def _ours(workload: Workload, backend: str) -> Draw:
+def _ours(workload: Workload, settings: SplatSettings, backend: str) -> Draw:
     def draw(rows: Gaussians) -> tuple[Tensor, Tensor]:
-        rendering = splat(rows, workload.camera, settings=gsplat_baseline.SETTINGS, backend=backend)
+        rendering = splat(rows, workload.camera, settings=settings, backend=backend)
         return rendering.rgb, rendering.alpha
 
     return draw
@@ -483,9 +520,9 @@ def compared(record: GpuRecord, compare: Callable[[], Errors]) -> GpuRecord:
     return replace(record, parity=difference, agrees=agrees(difference))
 
 
-def _against_truth(workload: Workload, backend: str) -> Errors:
+def _against_truth(workload: Workload, settings: SplatSettings, backend: str) -> Errors:
     """Errors of our op on the device against the C++ backend in float64."""
-    settings, kind = gsplat_baseline.SETTINGS, workload.device.type
+    kind = workload.device.type
     ours = answer(workload.rows, workload.camera, settings, backend, torch.float32, kind)
     return errors(ours, answer(workload.rows, workload.camera, settings, "cpu", torch.float64))
 
@@ -520,13 +557,20 @@ def _reason(error: Exception) -> str:
 USAGE = """\
 python -m benchmarks.gpu [key=value ...]     a CUDA device at 0.1 to 5 M splats, beside it gsplat, if installed
 
-  python -m benchmarks.gpu street=RUN             and the street of a trained run
-  python -m benchmarks.gpu street=RUN enlarge=2   that street alone, also in images twice as wide and high
-  python -m benchmarks.gpu quick=true             tiny sizes, also without a device: to see that it runs
+  python -m benchmarks.gpu street=RUN                      and the street of a trained run, before them
+  python -m benchmarks.gpu street=RUN enlarge=2 rows=[]    that street alone, also in images twice as wide and high
+  python -m benchmarks.gpu street=scene.street refine=3    of nine splats for each, seen three times as large
+  python -m benchmarks.gpu first=gsplat compares=false     gsplat before us: call both, and believe what both say
+  python -m benchmarks.gpu quick=true                      tiny sizes, also without a device: to see that it runs
 
   quick     true: tiny sizes and few repeats, whose times mean little
-  street    the folder of a trained run: its front camera in the first and in the middle frame
+  street    a run's folder, a .street or a scene.safetensors beside its views.json: its front camera in the first and in
+            the middle frame
+  refine    how many times as large the street is seen, each splat cut into refine x refine (default: 1)
   enlarge   factor of the larger images (default: 1)
+  rows      numbers of random splats (default: those of the tables in docs/gpu.md)
+  first     ours or gsplat: which is measured first at each size (default: ours)
+  compares  false: images and gradients are not compared
   out       folder for gpu.jsonl (default: outputs/bench)
 """
 
@@ -537,28 +581,18 @@ class GpuRequest:
 
     quick: bool = False
     street: Path | None = None
+    refine: int = 1
     enlarge: int = 1
+    rows: tuple[int, ...] = ROWS
+    first: Renderer = "ours"
+    compares: bool = True
     out: Path = Path("outputs/bench")
 
     def __post_init__(self) -> None:
-        if self.enlarge < 1 or (self.enlarge > 1 and self.street is None):
-            raise ValueError(f"enlarge shows street=RUN in images at least 1 time as wide, got {self.enlarge}")
-
-
-def front_streets(run: Path, enlarge: int = 1) -> list[BenchScene]:
-    """Return what the camera of the least number sees in a run's first and middle frame, also in larger images.
-
-    Raises FileNotFoundError if the folder holds no scene or no views.
-    """
-    stored, views = scene_and_views(run)
-    front = [view for view in views if view.camera_index == min(view.indices[1] for view in views)]
-    chosen = {place: front[place] for place in (0, len(front) // 2)}
-    streets = [street_at(run, stored, view) for view in chosen.values()]
-    larger = []
-    for street in streets if enlarge > 1 else ():
-        camera = resized(street.camera, enlarge * street.camera.height, enlarge * street.camera.width)
-        larger.append(replace(street, camera=camera))
-    return [*streets, *larger]
+        if min(self.enlarge, self.refine) < 1 or (max(self.enlarge, self.refine) > 1 and self.street is None):
+            raise ValueError(
+                f"enlarge and refine show street=RUN at least 1 time as large, got {self.enlarge} and {self.refine}"
+            )
 
 
 def main(words: list[str]) -> int:
@@ -576,13 +610,12 @@ def _measured(request: GpuRequest, command: str) -> bool:
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if device.type == "cpu" and not request.quick:
         raise ValueError("no CUDA device is available: quick=true runs it on the CPU, tiny")
-    streets = [] if request.street is None else front_streets(request.street, request.enlarge)
-    file = record_file(request.out, "gpu", command)
+    streets = [] if request.street is None else front_streets(request.street, request.enlarge, request.refine)
+    sizes, budget = [Size(width, height, rows) for width, height in IMAGES for rows in request.rows], BUDGET
     if request.quick:
-        return run_gpu([Size(64, 48, 500)], device, ONCE, file, streets=streets)
-    images = [] if request.enlarge > 1 else IMAGES
-    sizes = [Size(width, height, rows) for width, height in images for rows in ROWS]
-    return run_gpu(sizes, device, BUDGET, file, streets=streets)
+        sizes, budget = [Size(64, 48, 500)], ONCE
+    file = record_file(request.out, "gpu", command)
+    return run_gpu(sizes, device, budget, file, streets=streets, first=request.first, compares=request.compares)
 
 
 if __name__ == "__main__":

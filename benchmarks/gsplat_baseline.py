@@ -1,10 +1,11 @@
 """gsplat on the same splats, timed and checked for parity; our settings match its semantics.
 
-Written for gsplat 1.5.3, the newest release on PyPI. Its repository has since added exact ellipse-tile intersection,
-the clamp at 0.99 and the kernel work of 2026. A comparison with 1.5.3 says nothing about those.
+Written for gsplat 1.5.3, the newest release on PyPI, and 1.6, which is source only: it has exact ellipse-tile
+intersection, the clamp at 0.99 and the kernel work of 2026. A comparison with 1.5.3 says nothing about those.
 """
 
 import importlib
+import re
 from types import ModuleType
 from typing import Any
 
@@ -17,8 +18,6 @@ from sparsestreet.bench.timing import Cotangent, drop_gradients
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.types import Camera, Gaussians
 
-SETTINGS = SplatSettings.preset("gsplat15")
-"""Settings of our op in the comparison: gsplat's clamp, stop rule and near plane."""
 MODES = ("packed", "unpacked")
 """The first keeps only rows in view, which takes less memory. Which one is faster depends on the view."""
 
@@ -36,6 +35,16 @@ def find_gsplat(device: torch.device) -> ModuleType | str:
 def version(module: ModuleType) -> str:
     """Its version, or "unknown"."""
     return getattr(module, "__version__", "unknown")
+
+
+def settings_beside(module: ModuleType | None) -> SplatSettings:
+    """Return the settings of our op in the comparison: clamp, stop rule and near plane of that version.
+
+    Alpha ends at 0.999 up to 1.5 and at 0.99 from 1.6 on. Without a module, or a version: those of 1.5.
+    """
+    found = None if module is None else re.match(r"(\d+)\.(\d+)", version(module))
+    is_newer = found is not None and (int(found[1]), int(found[2])) >= (1, 6)
+    return SplatSettings.preset("gsplat16" if is_newer else "gsplat15")
 
 
 def draw(
@@ -68,7 +77,7 @@ def _rasterization(
     module: ModuleType, gaussians: Gaussians, camera: Camera, packed: bool
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Calls gsplat with ``absgrad``, because our op sums absolute screen gradients by default."""
-    degree = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians.sh.shape[1]]
+    degree, settings = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians.sh.shape[1]], settings_beside(module)
     return module.rasterization(
         means=gaussians.means,
         quats=gaussians.quaternions,
@@ -79,12 +88,12 @@ def _rasterization(
         Ks=camera.intrinsics.to(gaussians.means)[None],
         width=camera.width,
         height=camera.height,
-        near_plane=SETTINGS.near_plane,
-        eps2d=SETTINGS.eps2d,
+        near_plane=settings.near_plane,
+        eps2d=settings.eps2d,
         sh_degree=degree,
         packed=packed,
         absgrad=True,
-        rasterize_mode="antialiased" if SETTINGS.antialias else "classic",
+        rasterize_mode="antialiased" if settings.antialias else "classic",
     )
 
 
@@ -95,4 +104,5 @@ def parity(module: ModuleType, rows: Gaussians, camera: Camera, backend: str) ->
     Cotangent.of(camera, rows.means).backward(rgb, alpha)
     theirs = collect(rgb, rows)
     drop_gradients(rows)
-    return errors(theirs, answer(rows, camera, SETTINGS, backend, rows.means.dtype, rows.means.device.type))
+    settings = settings_beside(module)
+    return errors(theirs, answer(rows, camera, settings, backend, rows.means.dtype, rows.means.device.type))

@@ -15,8 +15,11 @@ TAKES = {
 }
 
 
-def fake_gsplat(brightness: float = 1.0) -> ModuleType:
-    """A module with gsplat's signature that renders with our op."""
+def fake_gsplat(brightness: float = 1.0, version: str = "1.5.3") -> ModuleType:
+    """A module with gsplat's signature that renders with our op, by the settings that match a version."""
+    module = ModuleType("gsplat")
+    vars(module).update(__version__=version)
+    settings = gsplat_baseline.settings_beside(module)
 
     def rasterization(**given):
         assert set(given) == TAKES
@@ -25,7 +28,7 @@ def fake_gsplat(brightness: float = 1.0) -> ModuleType:
         assert given["colors"].shape[1] == (given["sh_degree"] + 1) ** 2
         fields = ("means", "quats", "scales", "opacities", "colors")
         camera = Camera(given["viewmats"][0], given["Ks"][0], given["width"], given["height"])
-        rendering = splat(Gaussians(*(given[name] for name in fields)), camera, settings=gsplat_baseline.SETTINGS)
+        rendering = splat(Gaussians(*(given[name] for name in fields)), camera, settings=settings)
 
         class Means:
             absgrad = property(lambda self: rendering.screen_offsets.grad[None])
@@ -37,6 +40,5 @@ def fake_gsplat(brightness: float = 1.0) -> ModuleType:
         meta |= {"isect_offsets": offsets}
         return brightness * rendering.rgb[None], rendering.alpha[None, ..., None], meta
 
-    module = ModuleType("gsplat")
-    vars(module).update(__version__="1.5.3", rasterization=rasterization)
+    vars(module).update(rasterization=rasterization)
     return module

@@ -17,18 +17,15 @@ from sparsestreet.bench.accuracy import Errors, ImageError
 from sparsestreet.bench.records import RecordFile, read_records
 from sparsestreet.bench.scenes import BenchScene, Size, frustum_camera, frustum_gaussians
 from sparsestreet.bench.timing import TimeSpread, TimingBudget
-from sparsestreet.geometry.cameras import project
 from sparsestreet.ops import splat
 from sparsestreet.phases import WallClock
-from sparsestreet.scene.storage import save_scene
-from sparsestreet.scene.views import read_views, write_views
 from sparsestreet.types import Gaussians
 from tests.bench.fake_gsplat import fake_gsplat
 from tests.bench.test_records import PROVENANCE
-from tests.export.street import stored_street, street_views
 
 ONCE = TimingBudget(repeats=2, seconds=0.0, least=1)
 CPU = torch.device("cpu")
+SETTINGS = gsplat_baseline.settings_beside(None)
 
 
 def test_both_renderers_get_a_record(tmp_path, monkeypatch):
@@ -52,8 +49,8 @@ def test_both_renderers_get_a_record(tmp_path, monkeypatch):
 
 
 @pytest.mark.lengthy
-@pytest.mark.parametrize("slower", ["packed", "unpacked"])
-def test_gsplats_faster_mode_is_used_after_the_first_size(tmp_path, monkeypatch, slower):
+@pytest.mark.parametrize(("slower", "first"), [("packed", "ours"), ("unpacked", "ours"), ("unpacked", "gsplat")])
+def test_gsplats_faster_mode_is_used_after_the_first_size(tmp_path, monkeypatch, slower, first):
     module = fake_gsplat()
 
     def slow_in_one_mode(**given):
@@ -64,8 +61,11 @@ def test_gsplats_faster_mode_is_used_after_the_first_size(tmp_path, monkeypatch,
     vars(module).update(rasterization=slow_in_one_mode)
     monkeypatch.setattr(gsplat_baseline, "find_gsplat", lambda device: module)
     file = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE)
-    gpu.run_gpu([Size(48, 32, 60), Size(32, 32, 20), Size(32, 32, 30)], CPU, ONCE, file, lambda text: None)
-    theirs = [record["renderer"] for record in read_records(file.path) if record["renderer"].startswith("gsplat")]
+    sizes = [Size(48, 32, 60), Size(32, 32, 20), Size(32, 32, 30)]
+    gpu.run_gpu(sizes, CPU, ONCE, file, lambda text: None, first=first)
+    measured = [record["renderer"] for record in read_records(file.path)]
+    assert measured.index("sparsestreet cpu") == (0 if first == "ours" else 2)
+    theirs = [renderer for renderer in measured if renderer.startswith("gsplat")]
     faster = "unpacked" if slower == "packed" else "packed"
     assert theirs == [f"gsplat 1.5.3 {mode}" for mode in ("packed", "unpacked", faster, faster)]
 
@@ -91,6 +91,9 @@ def test_many_splats_are_not_compared(tmp_path, monkeypatch):
     file = RecordFile(tmp_path / "gpu.jsonl", PROVENANCE)
     assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, lambda text: None)
     assert [(record["parity"], record["agrees"]) for record in read_records(file.path)] == [(None, None)] * 3
+    monkeypatch.setattr(gpu, "TRUTH_ROWS", 60)
+    assert gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file, compares=False)
+    assert not gpu.run_gpu([Size(48, 32, 60)], CPU, ONCE, file)
 
 
 def test_a_peer_that_fails_is_on_record_and_ends_nothing(tmp_path, monkeypatch):
@@ -128,7 +131,7 @@ def test_a_device_without_a_fast_backend_is_not_measured(tmp_path, monkeypatch):
 
 def test_a_step_trains_all_fields_and_counts_the_view(rows):
     camera = frustum_camera(48, 32)
-    step = gpu.TrainingStep(rows, camera, gpu.our_render(camera, "cpu"))
+    step = gpu.TrainingStep(rows, camera, gpu.our_render(camera, SETTINGS, "cpu"))
     before = [parameter.detach().clone() for parameter in step.parameters]
     step()
     assert all(bool((old != new).any()) for old, new in zip(before, step.parameters, strict=True))
@@ -137,7 +140,7 @@ def test_a_step_trains_all_fields_and_counts_the_view(rows):
 
 
 def test_a_record_is_of_its_workload(tmp_path, monkeypatch):
-    """Two sizes and a street between them, each with its own scene, rows and image; wider than high, and higher."""
+    """A street and two sizes behind it, each with its own scene, rows and image; wider than high, and higher."""
     monkeypatch.setattr(gsplat_baseline, "find_gsplat", lambda device: "none")
     camera = frustum_camera(40, 56)
     street = BenchScene("a street", "of a run", frustum_gaussians(30, camera, sigma_pixels=2.0, terms=4), camera)
@@ -145,8 +148,8 @@ def test_a_record_is_of_its_workload(tmp_path, monkeypatch):
     assert gpu.run_gpu([Size(48, 32, 60), Size(32, 48, 20)], CPU, ONCE, file, said.append, [street])
     records = read_records(file.path)
     assert [(one["kind"], one["scene"], one["rows"], one["width"], one["height"]) for one in records] == [
-        ("gpu", "random frustum", 60, 48, 32),
         ("gpu", "of a run", 30, 40, 56),
+        ("gpu", "random frustum", 60, 48, 32),
         ("gpu", "random frustum", 20, 32, 48),
     ]
     assert {one["device"] for one in records} == {"cpu: these are no GPU timings"}
@@ -165,7 +168,7 @@ def test_memory_and_stages_are_of_a_whole_step(rows, monkeypatch):
 
     def draw(given: Gaussians) -> tuple[torch.Tensor, torch.Tensor]:
         drawn.append(torch.is_grad_enabled())
-        rendering = splat(given, camera, settings=gsplat_baseline.SETTINGS)
+        rendering = splat(given, camera, settings=SETTINGS)
         return rendering.rgb, rendering.alpha
 
     def run_once(step, answer):
@@ -212,7 +215,7 @@ def test_every_number_of_a_record_is_in_its_line():
     busy = dataclasses.replace(
         whole, launches=31, waits=1, stages={"sort": TimeSpread(1.25, 1.0, 0.125, 20), "x": step}
     )
-    said = "  peak     345 MB  31 launches, 1 waits  [sort 1.250 (iqr 0.125), x 4.000]"
+    said = "  peak     345 MB  31 launches, 1 waits  [sort 1.250 (1.000), x 4.000]"
     assert gpu.line(busy) == gpu.line(whole).replace("  peak     345 MB", said)
     without = dataclasses.replace(whole, samples=None)
     assert gpu.line(without) == gpu.line(whole).replace(", 70 M samples", "")
@@ -374,35 +377,19 @@ def test_without_a_device_quick_runs_and_the_rest_is_an_error(tmp_path, capsys, 
     assert gpu.main(["quick=true", f"out={tmp_path}"]) == 1
 
 
-def made_street(folder: Path) -> Path:
-    """A run of 37 splats, four cameras, five frames, of which the front camera's third is held out."""
-    save_scene(folder / "scene.safetensors", stored_street())
-    views = street_views()
-    write_views(folder / "views.json", [*views[:8], *views[9:]], [views[8]])
-    return folder
-
-
-def test_the_front_camera_sees_the_first_frame_and_the_middle_one_also_in_larger_images(tmp_path):
-    run = made_street(tmp_path / "run")
-    first, middle, *larger = gpu.front_streets(run, 2)
-    views = [view for view in read_views(run / "views.json").all if view.camera_index == 0]
-    for street, view, wide in zip((first, middle), (views[0], views[2]), larger, strict=True):
-        assert street.source == f"trained: run on hand-made, frame {view.frame_index}"
-        assert torch.equal(street.camera.camera_from_world, view.camera.camera_from_world)
-        assert wide.gaussians is street.gaussians
-        assert (wide.camera.width, wide.camera.height) == (2 * street.camera.width, 2 * street.camera.height)
-        pixels, depths, _ = project(street.camera, street.gaussians.means)
-        seen = depths > 0
-        torch.testing.assert_close(project(wide.camera, street.gaussians.means)[0][seen], 2 * pixels[seen])
-
-
-def test_a_street_is_beside_the_sizes_and_alone_in_larger_images(tmp_path, monkeypatch):
+def test_a_street_comes_first_as_large_as_asked_and_sizes_are_those_named(tmp_path, monkeypatch):
     given = {}
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(
-        gpu, "run_gpu", lambda sizes, device, *_, streets: given.update(n=(len(sizes), streets)) or True
-    )
+
+    def run_gpu(sizes, device, budget, file, *, streets, first, compares):
+        given.update(sizes=len(sizes), streets=streets, how=(first, compares))
+        return True
+
+    monkeypatch.setattr(gpu, "run_gpu", run_gpu)
     monkeypatch.setattr(gpu, "front_streets", lambda *words: [words])
-    for words, sizes, enlarge in (([], 10, 1), (["enlarge=2"], 0, 2)):
+    for words, sizes, factors, how in (
+        ([], 10, (1, 1), ("ours", True)),
+        (["enlarge=2", "refine=3", "rows=7", "first=gsplat", "compares=false"], 2, (2, 3), ("gsplat", False)),
+    ):
         assert gpu.main(["street=RUN", *words, f"out={tmp_path}"]) == 0
-        assert given["n"] == (sizes, [(Path("RUN"), enlarge)])
+        assert given == {"sizes": sizes, "streets": [(Path("RUN"), *factors)], "how": how}

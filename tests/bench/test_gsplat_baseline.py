@@ -38,12 +38,27 @@ def test_a_gradient_alone_can_disagree():
     assert not agrees(Errors(image, {"means": GradientError(None, None)}))
 
 
-def test_settings_are_those_of_gsplat():
-    assert (gsplat_baseline.SETTINGS.stop, gsplat_baseline.SETTINGS.alpha_max, gsplat_baseline.SETTINGS.near_plane) == (
-        "exclusive",
-        0.999,
-        0.01,
+@pytest.mark.parametrize(
+    ("version", "alpha_max"),
+    [("1.5.3", 0.999), ("1.6.0", 0.99), ("1.10.0rc1", 0.99), ("2.0", 0.99), ("unknown", 0.999)],
+)
+def test_settings_are_those_of_its_version(version, alpha_max):
+    settings = gsplat_baseline.settings_beside(fake_gsplat(version=version))
+    assert (settings.stop, settings.alpha_max, settings.near_plane) == ("exclusive", alpha_max, 0.01)
+    assert gsplat_baseline.settings_beside(None).alpha_max == 0.999
+
+
+def test_a_newer_version_agrees_where_its_clamp_shows(rows):
+    """Opacities above 0.99: the settings of the older version would differ."""
+    with torch.no_grad():
+        rows.opacities.fill_(0.998)
+    camera = frustum_camera(48, 32)
+    assert agrees(gsplat_baseline.parity(fake_gsplat(version="1.6.0"), rows, camera, "cpu"))
+    older = gsplat_baseline.answer(rows, camera, gsplat_baseline.settings_beside(None), "cpu", torch.float32)
+    newer = gsplat_baseline.answer(
+        rows, camera, gsplat_baseline.settings_beside(fake_gsplat(version="1.6.0")), "cpu", torch.float32
     )
+    assert not agrees(gsplat_baseline.errors(older, newer))
 
 
 def test_gsplat_is_looked_for_on_a_cuda_device_only(monkeypatch):

@@ -188,11 +188,10 @@ def _stored(run: Path) -> "tuple[StoredScene, View]":
 
 
 def scene_and_views(run: Path) -> "tuple[StoredScene, tuple[View, ...]]":
-    """Return the scene and all recorded views of a run's folder."""
-    from sparsestreet.scene.storage import load_scene
-    from sparsestreet.scene.views import VIEWS_FILE, read_views
+    """Return the scene and all recorded views of a run's folder, a scene file in it, or a .street."""
+    from sparsestreet.scene.storage import load_scene, views_of
 
-    return load_scene(run), read_views(run / VIEWS_FILE).all
+    return load_scene(run), views_of(run).all
 
 
 def record_file(folder: Path, name: str, command: str) -> "RecordFile":
