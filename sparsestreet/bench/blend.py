@@ -221,10 +221,16 @@ def image_difference(gaussians: Gaussians, camera: Camera) -> Difference:
     return Difference(difference.numel(), ties, float(difference.max()), float(rest.max()) if len(rest) else 0.0)
 
 
-def measured_peak(size: int = 2048) -> float:
+def measured_peak(device: torch.device | str = "cpu", size: int = 2048) -> float:
     """float32 operations per second of a matrix product, the best of several."""
-    a, b = torch.randn(size, size), torch.randn(size, size)
-    return 2 * size**3 / min(_repeat(lambda: a @ b, TimingBudget(repeats=5)))
+    a, b = torch.randn(size, size, device=device), torch.randn(size, size, device=device)
+
+    def product() -> None:
+        a @ b
+        if a.is_cuda:
+            torch.cuda.synchronize(a.device)
+
+    return 2 * size**3 / min(_repeat(product, TimingBudget(repeats=5)))
 
 
 def lines(record: BlendRecord) -> list[str]:

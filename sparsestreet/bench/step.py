@@ -22,6 +22,7 @@ from sparsestreet.bench.blend import BACKWARD_FLOPS, FORWARD_FLOPS, measured_pea
 from sparsestreet.bench.figures import save_figure
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.timing import TimeSpread, last_workspace, spread
+from sparsestreet.evaluation.speed import device_name, peak_megabytes
 from sparsestreet.ops.ssim_window import WINDOW
 from sparsestreet.phases import PhaseRecorder, clock_of
 from sparsestreet.scene.rendering import SceneRendering
@@ -158,6 +159,11 @@ class StepRecord:
     bandwidth_gb_s: float
     peak_gflops: float
     phases: tuple[PhaseRecord, ...]
+    device: str = "cpu"
+    unwatched_ms: float | None = None
+    """Wall clock of a step before the window, moved views included, where the host may run ahead of a device."""
+    peak_device_mb: float | None = None
+    """10^6 bytes that torch had allocated on a GPU at most until the end of the window; None on the CPU."""
 
     @property
     def ratio(self) -> float:
@@ -229,11 +235,25 @@ class StepWatch(Callback):
         self.seconds: list[dict[str, float]] = []
         self.work: list[StepWork] = []
         self.operations: Counter[str] = Counter()
+        self.unwatched: float | None = None
+        """Seconds of a step before the window, the mean of as many as are timed in it."""
+        self.device = torch.device("cpu")
+        """Where the steps run: when training has ended, Lightning takes the system back to the CPU."""
+        self.peak_mb: float | None = None
+        self._began: tuple[int, float] = (0, 0.0)
+        """The step from which on unwatched ones count, and when it ended."""
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: StreetSystem, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         step, window = trainer.global_step, self.window
+        self.device = pl_module.device
+        if step == max(window.first - window.timed, 1):
+            self._began = step, time.perf_counter()
+        if step == window.first > self._began[0] > 0:
+            self.unwatched = (time.perf_counter() - self._began[1]) / (step - self._began[0])
+        if step == window.first + window.timed:
+            self.peak_mb = peak_megabytes(self.device)[1]
         if window.first < step <= window.first + window.timed:
             self.seconds.append(self._recorder.stop())
             if (rendering := pl_module.rendering) is not None:
@@ -293,7 +313,7 @@ def run_step(
 
 
 def _record(what: str, system: StreetSystem, watch: StepWatch) -> StepRecord:
-    bandwidth, peak = measured_bandwidth(system.device), measured_peak()
+    bandwidth, peak = measured_bandwidth(watch.device), measured_peak(watch.device)
     least = floors(watch.work)
     names = sorted(
         {name for seconds in watch.seconds for name in seconds} | watch.operations.keys(),
@@ -317,6 +337,9 @@ def _record(what: str, system: StreetSystem, watch: StepWatch) -> StepRecord:
         1e-9 * bandwidth,
         1e-9 * peak,
         tuple(phases),
+        device_name(watch.device),
+        None if watch.unwatched is None else 1e3 * watch.unwatched,
+        watch.peak_mb,
     )
 
 
@@ -344,9 +367,12 @@ def lines(record: StepRecord) -> list[str]:
             f"{phase.name:<22}{phase.time.median:8.2f}{phase.time.iqr or 0.0:7.2f}{100 * share:6.0f}%"
             f"{phase.operations:12.0f}{floor}"
         )
+    unwatched = "" if record.unwatched_ms is None else f"; {record.unwatched_ms:.2f} ms unwatched, moved views included"
+    memory = "" if record.peak_device_mb is None else f"; {record.peak_device_mb:,.0f} MB of the device"
     return [
         *text,
         f"a step {record.step}; {record.ratio:.2f} times its op {record.op}; {record.operations:.0f} operations",
+        f"on {record.device}{unwatched}{memory}",
         f"floors: {record.bandwidth_gb_s:.0f} GB/s (addition in place), "
         f"{record.peak_gflops:.0f} GFLOP/s (float32 matrix product)",
     ]

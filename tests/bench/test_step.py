@@ -1,6 +1,7 @@
 """Phases of a step: which steps are watched, what their record holds, floors, and what is said and drawn of it."""
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +96,7 @@ def test_a_window_of_a_run_is_timed_then_counted(monkeypatch):
     monkeypatch.setattr(step.StepWork, "of", staticmethod(lambda *given: work.append(given) or WORK))
     seen = []
     monkeypatch.setattr(step, "_samples", lambda rendering: seen.append(rendering) or 7)
+    monkeypatch.setattr(step, "peak_megabytes", lambda device: (1.0, 100 * now[0]))
     system = make_system({"background": background(5)})
     take = system.training_step
 
@@ -119,6 +121,8 @@ def test_a_window_of_a_run_is_timed_then_counted(monkeypatch):
     assert len(set(map(id, seen))) == 3  # each step's own
     assert {given[2] for given in work} == {7}
     assert watch.operations["loss photometric"] > 0
+    assert watch.unwatched == pytest.approx(1.0)  # of step 2 alone: the first does not count
+    assert watch.peak_mb == 500.0  # after step 5
     before = Counter(watch.operations)
     trainer.train(1, frame_at())
     assert watch.operations == before
@@ -149,15 +153,19 @@ def watched(window: StepWindow) -> StepWatch:
 
 def test_a_record_has_medians_operations_and_floors(monkeypatch, tmp_path):
     watch = watched(StepWindow(0, 2, 2))
+    watch.device, watch.unwatched, watch.peak_mb = torch.device("cuda"), 0.003, 1234.5
     monkeypatch.setattr(step, "StepWatch", lambda window: watch if window == WINDOW else None)
     asked = []
     monkeypatch.setattr(step, "measured_bandwidth", lambda device: asked.append(device) or 4e9)
-    monkeypatch.setattr(step, "measured_peak", lambda: 5e9)
+    monkeypatch.setattr(step, "measured_peak", lambda device: asked.append(device) or 5e9)
+    monkeypatch.setattr(step, "device_name", lambda device: f"a {device.type}")
     monkeypatch.setattr(step, "draw_step", lambda record, folder: asked.append((record, folder)) or [Path("one.svg")])
     system = make_system({"background": background(5), "rigid": rigid(3)})
     file, said = RecordFile(tmp_path / "step.jsonl", PROVENANCE), []
     record = run_step("train x", lambda one: asked.append(one) or system, WINDOW, file, tmp_path / "o", said.append)
-    assert asked == [watch, system.device, (record, tmp_path / "o")]
+    # Where the steps ran: when training has ended, the system is on the CPU.
+    assert asked == [watch, torch.device("cuda"), torch.device("cuda"), (record, tmp_path / "o")]
+    assert (record.device, record.unwatched_ms, record.peak_device_mb) == ("a cuda", pytest.approx(3.0), 1234.5)
     assert (record.what, record.gaussians, record.width, record.height) == (
         "train x", {"background": 5, "rigid": 3}, 9, 7,
     )  # fmt: skip
@@ -181,7 +189,10 @@ def test_a_record_has_medians_operations_and_floors(monkeypatch, tmp_path):
 
 def test_the_table_of_a_step():
     """Shares are of the step's median: 10, 20, 0.25 and 6 of 40 ms."""
-    first, header, *phases, whole, floor = lines(RECORD)
+    first, header, *phases, whole, where, floor = lines(RECORD)
+    assert where == "on cpu"
+    full = replace(RECORD, device="a card", unwatched_ms=4.25, peak_device_mb=12345.0)
+    assert lines(full)[-2] == "on a card; 4.25 ms unwatched, moved views included; 12,345 MB of the device"
     assert first == "train x: background 1,234, rigid 56, 640x480"
     assert header.split() == ["phase", "ms", "iqr", "share", "operations", "least", "ms", "distance"]
     assert [line.split() for line in phases] == [
