@@ -11,7 +11,7 @@ export MPLCONFIGDIR := $(CURDIR)/.cache/matplotlib
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help quick elsewhere test test-all stress lint style types docs numbers demo bench tables claims figure clean FORCE
+.PHONY: help quick elsewhere test test-all stress lint style types docs numbers demo bench tables claims figure gpu-pack clean FORCE
 
 help: ## this list
 	@awk 'BEGIN { FS = ":.*## " } /^[a-z-]+:.*## / { printf "make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -89,6 +89,10 @@ claims: $(VENV)/.ok ## what the paper claims, at equal count, and what accuracy 
 figure: $(VENV)/.ok ## quality against training and frame time on the default streets (9 trainings): docs/figures/time.png
 	$(TRAIN) +sweep=readme; status=$$?; \
 	$(BIN)/sparsestreet report sweep=outputs/sweeps/readme figure=docs/figures/time.png; exit $$status
+
+gpu-pack: $(VENV)/.ok ## what travels to a GPU for scripts/gpu_quarter.sh: .gpu; PLAIN=RUN PRUNED=RUN STREET=DIR GSPLAT=DIR name parts
+	$(BIN)/python scripts/gpu_pack.py wheels=true $(if $(PLAIN),plain=$(PLAIN)) $(if $(PRUNED),pruned=$(PRUNED)) \
+	  $(if $(STREET),street=$(STREET)) $(if $(GSPLAT),gsplat=$(GSPLAT))
 
 clean: ## removes what the targets made
 	rm -rf $(VENV) build outputs/demo outputs/site outputs/streets outputs/cache

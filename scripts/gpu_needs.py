@@ -23,6 +23,7 @@ PACKAGES = {
     "tests take turns and may not end in time": ("xdist",),
     "test files left out": ("hypothesis",),
     "nothing beside our times": ("gsplat",),
+    "no .street is read or written": ("zstandard",),
 }
 DISTRIBUTIONS = {
     "hydra": "hydra-core",
@@ -33,6 +34,8 @@ DISTRIBUTIONS = {
     "xdist": "pytest-xdist",
     "gsplat": "gsplat==1.5.3",
 }
+CARRIED = ("hydra-core", "omegaconf", "antlr4-python3-runtime==4.9.3", "beartype", "zstandard", "gsplat==1.5.3")
+"""What a machine for training networks lacks: distributions whose wheels gpu_pack.py fetches."""
 
 
 def unpack_wheels(folder: Path, site: Path) -> list[str]:
