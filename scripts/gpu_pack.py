@@ -7,6 +7,7 @@ python scripts/gpu_pack.py [key=value ...]
   street    folder of a street that is traced already; else it is traced, 400 seconds of a core
   gsplat    folder or .tar.gz of gsplat's sources, which take the place of the wheel's; its math library is added
   wheels    false: none are fetched (default: true)
+  library   true: the built C++ backend goes along, for an x86-64 machine without cmake (default: false)
   python    version on that machine (default: 3.12)
   out       the folder (default: .gpu); what lies there is replaced
 
@@ -21,10 +22,12 @@ import sys
 import tarfile
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from io import BytesIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from zipfile import ZipFile
 
+import numpy as np
 from gpu_needs import CARRIED
 
 from sparsestreet.cli.commands.export import export
@@ -36,6 +39,8 @@ MOST = 55 * 2**20
 """Bytes."""
 STREET = StreetSettings(width=960, height=640, jpeg=95)
 """Forty frames of three cameras."""
+LIDAR, LIDAR_STEP = "lidar", 2.0**-10
+"""Folder of the returns, float32 x, y, z and intensity; meters. The sensor has 20 mm of noise."""
 NEEDLESS = "depth"
 """Folder of a street that no reader looks into: half of its bytes."""
 PLATFORMS = ("manylinux_2_28_x86_64", "manylinux_2_17_x86_64", "manylinux2014_x86_64")
@@ -52,6 +57,7 @@ class PackRequest:
     street: Path | None = None
     gsplat: Path | None = None
     wheels: bool = True
+    library: bool = False
     python: str = "3.12"
     out: Path = Path(".gpu")
 
@@ -65,9 +71,8 @@ def pack(request: PackRequest) -> None:
         fetch_wheels(out / "wheels", request.python)
     if request.gsplat is not None:
         pack_sources(request.gsplat, out)
-    library = find_library()
-    if library is not None and platform.machine() == "x86_64":
-        shutil.copy(library, out / "libsparsestreet_splat.so")
+    if request.library:
+        pack_library(out)
     for name in ("plain", "pruned"):
         if (scene := getattr(request, name)) is not None:
             pack_scene(scene, out / f"{name}.street")
@@ -96,6 +101,14 @@ def fetch_wheels(folder: Path, python: str) -> None:
             made = subprocess.run(make, check=False, capture_output=True, text=True)
             if made.returncode:
                 raise ValueError(f"no wheel of {name}: {made.stderr.strip().splitlines()[-1]}")
+
+
+def pack_library(out: Path) -> None:
+    """Copy the C++ backend. Raises ValueError where there is none that would run there."""
+    library = find_library()
+    if library is None or platform.machine() != "x86_64":
+        raise ValueError(f"no C++ backend for x86-64 is built on this {platform.machine()}: say library=false")
+    shutil.copy(library, out / library.name)
 
 
 def pack_sources(sources: Path, out: Path) -> None:
@@ -134,12 +147,22 @@ def pack_scene(scene: Path, to: Path) -> None:
 
 
 def pack_street(street: Path, out: Path) -> None:
-    """Pack a street without what nobody reads, and the options of train that describe it."""
+    """Pack a street without what nobody reads, and the options of train that describe it.
+
+    Returns of the lidar are rounded to whole ``LIDAR_STEP``, which packs them to less than half.
+    """
     (out / "street.options").write_text("\n".join(street_words(street)) + "\n", encoding="utf-8")
-    with tarfile.open(out / "street.tar", "w") as archive:  # images are compressed already
-        for path in sorted(street.iterdir()):
-            if path.name != NEEDLESS:
-                archive.add(path, path.name)
+    with tarfile.open(out / "street.tar.xz", "w:xz") as archive:
+        for path in sorted(path for path in street.rglob("*") if path.is_file()):
+            name = path.relative_to(street)
+            if name.parts[0] == LIDAR:
+                returns = np.fromfile(path, np.float32)
+                rounded = (np.round(returns / LIDAR_STEP) * LIDAR_STEP).astype(np.float32).tobytes()
+                entry = tarfile.TarInfo(str(name))
+                entry.size = len(rounded)
+                archive.addfile(entry, BytesIO(rounded))
+            elif name.parts[0] != NEEDLESS:
+                archive.add(path, str(name))
 
 
 def street_words(street: Path) -> Iterator[str]:

@@ -42,6 +42,7 @@ run_part() { # part, limit in seconds, log, command...
   local part="$1" limit="$2" log="$3" began="$SECONDS" left status foreseen
   shift 3
   left=$((BUDGET - SECONDS))
+  [ "$DRY" = 0 ] || limit=$((5 * limit)) # nothing is measured, and the machine may be busy
   [ "$limit" -le "$left" ] || limit="$left"
   if [ "$limit" -lt 5 ]; then
     row "$part" failed 0 "no time was left"

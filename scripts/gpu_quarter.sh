@@ -46,6 +46,7 @@ rm -rf "$OUT"
 mkdir -p "$HOME_FOLDER" "$STAY/runs"
 # Unpacked again, they would be newer than what was compiled of them.
 [ -d "$SITE" ] || [ ! -d "$PACK/wheels" ] || SPARSESTREET_WHEELS="$PACK/wheels"
+[ "$DRY" = 0 ] || BUDGET=3000
 . scripts/gpu_parts.sh
 
 PLAIN="$STAY/runs/plain" PRUNED="$STAY/runs/pruned"
@@ -78,7 +79,7 @@ quote() { # part, pattern
 unpack_sources() {
   [ -f "$PACK/gsplat.tar.gz" ] && [ -n "${SPARSESTREET_WHEELS:-}" ] || return
   rm -rf "$SITE"/gsplat "$SITE"/gsplat-*
-  tar --extract --gzip --file "$PACK/gsplat.tar.gz" --directory "$SITE"
+  "$PYTHON" -m tarfile -e "$PACK/gsplat.tar.gz" "$SITE"
 }
 
 # The street and how it is trained: 960x640, three cameras, a million first Gaussians, 30,000 steps.
@@ -93,8 +94,8 @@ choose_training() {
   fi
   [ ! -f "$PACK/street.options" ] || mapfile -t STREET <"$PACK/street.options"
   TRAIN+=("${STREET[@]}" "data.log.root=$STAY/street" "cache=$STAY/cache" "branch_points=[0.93334]")
-  [ -d "$STAY/street" ] || [ ! -f "$PACK/street.tar" ] ||
-    { mkdir -p "$STAY/street" && tar --extract --file "$PACK/street.tar" --directory "$STAY/street"; }
+  [ -d "$STAY/street" ] || [ ! -f "$PACK/street.tar.xz" ] ||
+    { mkdir -p "$STAY/street" && "$PYTHON" -m tarfile -e "$PACK/street.tar.xz" "$STAY/street"; }
 }
 
 run_step() {

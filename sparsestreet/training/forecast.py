@@ -149,42 +149,63 @@ def _seconds(work: Callable[[], object], device: torch.device) -> float:
 
 log = logging.getLogger(__name__)
 
-COPIES = 4
-"""Of each column: values, gradient and Adam's two moments."""
-STEP_BYTES = 350
-"""For each Gaussian, what a step projects, sorts and differentiates beside its columns: 341 with 5 million Gaussians at
-1920x1280 on an H100 (benchmarks/gpu.jsonl, peak less values and gradients)."""
-PIXEL_BYTES = 51
-"""For each pixel of an image: from 960x640 to 1920x1280 with 1,000 Gaussians, from the same records."""
-
-
+COPIES = 3
+"""Of each column, always: values and Adam's two moments."""
+ACTIVATED = 4 * 59
+"""Bytes of a Gaussian as it is drawn, with harmonics of degree 3. Its gradient takes as much, for each view."""
+STATISTICS = 16 + 8
+"""Bytes a Gaussian of density control, and of the gradient on screen that it reads."""
+SCREEN = 4 * 12 + 2 * 4 + 3 * 4
+"""Bytes a Gaussian and view, kept for the backward pass: its record, radius and tiles, and its place in the lists."""
+SUMS = 4 * 12
+"""Bytes a Gaussian of gradients on screen, summed over its pairs."""
+PAIRS = 3.3
+"""(Splat, tile) pairs of a Gaussian: of 5 million random ones at 1920x1280; those of a street have 1.4
+(benchmarks/gpu.jsonl, gpu_street.jsonl)."""
+PAIR, SLOT = 15.0, 4 * 12.0
+"""Bytes of a pair in the lists, with the room that a view does not fill, and of its gradients."""
+PIXEL_BYTES = 110
+"""For each pixel of an image: layers, their gradients, the recorded image, SSIM and its derivatives."""
 MARGIN = 0.1
 """Of what is free, left to others: allocators round, and images differ in what they need."""
 
 
-def foreseen_bytes(rows: int, row_bytes: float, pixels: int) -> float:
-    """What a training step needs on its device at once, in each process: all have all Gaussians.
+def foreseen_bytes(rows: int, row_bytes: float, pixels: int, *, moved: bool = True) -> float:
+    """Return what a training step needs on its device at once, in each process: all have all Gaussians.
+
+    The most is held while gradients of splats become those of what is drawn, or these become those of columns.
 
     Args:
         rows: Gaussians.
         row_bytes: of the columns of one.
         pixels: of the largest image.
+        moved: whether some steps render a second view (``training.moved_views``).
 
     >>> f"{foreseen_bytes(5_000_000, 236.0, 1920 * 1280) / 1e9:.1f} GB"
-    '6.6 GB'
+    '9.7 GB'
     """
-    return rows * (COPIES * row_bytes + STEP_BYTES) + PIXEL_BYTES * pixels
+    return rows * _bytes_a_row(row_bytes, moved) + PIXEL_BYTES * pixels
 
 
-def memory_problem(now: int, grown: int, row_bytes: float, pixels: int, available: float) -> str | None:
+def _bytes_a_row(row_bytes: float, moved: bool) -> float:
+    views = 2 if moved else 1
+    held = COPIES * row_bytes + ACTIVATED + STATISTICS + views * (SCREEN + PAIRS * PAIR)
+    of_splats = views * ACTIVATED + SUMS + PAIRS * SLOT
+    of_columns = ACTIVATED + row_bytes
+    return held + max(of_splats, of_columns)
+
+
+def memory_problem(
+    now: int, grown: int, row_bytes: float, pixels: int, available: float, *, moved: bool = True
+) -> str | None:
     """A warning where the scene may outgrow ``available`` bytes; None where it cannot.
 
     Raises ValueError where not even the Gaussians at the start fit.
     """
-    needed = foreseen_bytes(grown, row_bytes, pixels)
+    needed = foreseen_bytes(grown, row_bytes, pixels, moved=moved)
     if needed <= available:
         return None
-    start = foreseen_bytes(now, row_bytes, pixels)
+    start = foreseen_bytes(now, row_bytes, pixels, moved=moved)
     rows, needed = (now, start) if start > available else (grown, needed)
     said = (
         f"{rows:,} Gaussians and an image of {pixels:,} pixels need about {needed / 1e9:.1f} GB, and the device has "
@@ -196,10 +217,11 @@ def memory_problem(now: int, grown: int, row_bytes: float, pixels: int, availabl
     return f"the scene may outgrow the device: {said}"
 
 
-def bytes_of_row(rows: Rows) -> int:
-    """What a step needs for one more Gaussian of a node."""
+def bytes_of_row(rows: Rows, *, moved: bool = True) -> int:
+    """Return what a step needs for one more Gaussian of a node; ``moved`` as in ``foreseen_bytes``."""
     columns = rows.columns().values()
-    return COPIES * sum(column[:1].numel() * column.element_size() for column in columns) + STEP_BYTES
+    row_bytes = float(sum(column[:1].numel() * column.element_size() for column in columns))
+    return round(_bytes_a_row(row_bytes, moved))
 
 
 def bytes_for_growth(device: torch.device) -> float:
@@ -222,7 +244,8 @@ def report_memory(system: StreetSystem, data: StreetData) -> None:
     pixels = max(view.camera.width * view.camera.height for view in data.split.train.views)
     # What torch holds already will serve.
     available = torch.cuda.mem_get_info(system.device)[0] + torch.cuda.memory_reserved(system.device)
-    if problem := memory_problem(now, largest(system), row_bytes, pixels, available):
+    moved = system.moved_views is not None
+    if problem := memory_problem(now, largest(system), row_bytes, pixels, available, moved=moved):
         log.warning(problem)
 
 

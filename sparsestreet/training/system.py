@@ -132,6 +132,7 @@ class StreetSystem(LightningModule):
                 if node.mask is not None:
                     node.mask.at_image(image_number(self.trainer, index))
         frame = self.resolution.of(frame, self.global_step, self.course)
+        self.rendering = None  # else its tables, half a kilobyte a Gaussian, lie beside those of the new one
         # Losses divide small numbers: they stay in float32 whatever the trainer's precision.
         with torch.autocast(self.device.type, enabled=False):
             self.rendering = render(self.scene, frame, state, self.options, self.pixel_weights)

@@ -247,7 +247,7 @@ class DensityControl(Callback, RowListener):
         rows = system.scene.nodes[name].rows
         if added <= 0:
             return None
-        free, needed = bytes_for_growth(system.device), bytes_of_row(rows)
+        free, needed = bytes_for_growth(system.device), bytes_of_row(rows, moved=system.moved_views is not None)
         if self._ranks.size > 1:  # all do what the fullest one can
             device = system.device
             free = -float(self._ranks.largest(torch.tensor(-free, dtype=torch.float64, device=device)))
