@@ -90,6 +90,7 @@ choose_training() {
   if [ "$DRY" = 1 ]; then
     STREET=(data.log.settings.{width=64,height=48,num_frames=10,num_cameras=1})
     TRAIN=(trainer=cpu schedule.max_steps=40 trainer.val_check_interval=40 node.background.num_points=300
+      image_points=none moved_views=none
       evaluation.timing.{warmup=1,repeats=2,rounds=1})
   fi
   [ ! -f "$PACK/street.options" ] || mapfile -t STREET <"$PACK/street.options"

@@ -125,8 +125,8 @@ def peak_bytes(rows: int, width: int, height: int, *, moved: bool) -> int:
 @pytest.mark.skipif(not has_triton(), reason="of the tables of Triton's path")
 @pytest.mark.parametrize(("moved", "pairs"), [(False, 1.0), (False, PAIRS), (False, 8.0), (True, PAIRS)])
 def test_the_forecast_counts_what_a_step_allocates(device_path, monkeypatch, moved, pairs):
-    """Within 3 %: the room of lists goes in steps of an eighth. The rendering of the step before, were it kept, would be
-    7 to 12 %."""
+    """Within 3 %: the room of lists goes in steps of an eighth. The rendering of the step before, were it kept, would
+    be 7 to 12 %."""
     device_path(pairs)
     monkeypatch.setattr(forecast, "PAIRS", pairs)
     few, many = (peak_bytes(rows, 64, 48, moved=moved) for rows in (40_000, 80_000))
