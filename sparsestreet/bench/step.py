@@ -21,7 +21,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from sparsestreet.bench.blend import BACKWARD_FLOPS, FORWARD_FLOPS, measured_peak
 from sparsestreet.bench.figures import save_figure
 from sparsestreet.bench.records import RecordFile
-from sparsestreet.bench.timing import TimeSpread, last_workspace, spread
+from sparsestreet.bench.timing import TimeSpread, spread
 from sparsestreet.evaluation.speed import device_name, peak_megabytes
 from sparsestreet.ops.ssim_window import WINDOW
 from sparsestreet.phases import PhaseRecorder, clock_of
@@ -348,9 +348,14 @@ def _total(watch: StepWatch, name: str) -> float:
 
 
 def _samples(rendering: SceneRendering) -> int | None:
-    """(splat, pixel) samples of the newest rendering, where the backend counts them."""
-    rows = rendering.splats.radii
-    return last_workspace(rows.dtype).sample_count() if rows.device.type == "cpu" else None
+    """(splat, pixel) samples of a rendering whose graph is there, where the backend counts them."""
+    nodes = [rendering.splats.rgb.grad_fn]
+    while nodes:
+        node = nodes.pop()
+        if (lease := getattr(node, "lease", None)) is not None:
+            return lease.workspace.sample_count()
+        nodes += [] if node is None else [following for following, _ in node.next_functions]
+    return None
 
 
 def lines(record: StepRecord) -> list[str]:
