@@ -28,6 +28,7 @@ from sparsestreet.bench.step import (
 )
 from sparsestreet.bench.timing import TimeSpread
 from sparsestreet.phases import PhaseRecorder, WallClock, phase
+from sparsestreet.scene.rendering import render
 from tests.bench.test_records import PROVENANCE
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
 from tests.typed import as_a
@@ -137,6 +138,17 @@ def test_operations_belong_to_the_innermost_phase_and_views_are_none():
             values.view(2, 2).add(1.0, alpha=2.0).mul(2.0)
     recorder.stop()
     assert operations == {"rest": 1, "a part": 2}
+
+
+def test_samples_are_those_of_the_rendering_itself():
+    """Not of one that took its workspace back before: of two sizes, each counts its own."""
+    system = make_system({"background": background(30)})
+    small, large = (render(system.scene, frame_at(0, width, width // 2)) for width in (16, 48))
+    (large.rgb.sum() + small.rgb.sum()).backward()
+    few, many = step._samples(small), step._samples(large)
+    assert few is not None
+    assert many is not None
+    assert 0 < few < many
 
 
 def watched(window: StepWindow) -> StepWatch:
