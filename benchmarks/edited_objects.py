@@ -166,10 +166,12 @@ class Mean:
     psnr: dict[str, float]
     """log and found, dB."""
     psnr_before: dict[str, float]
-    ghost: dict[str, float] | None
+    ghost: dict[str, float]
+    """Medians; none where nothing was taken away."""
     lost: float
-    """dB by which found boxes are behind, and half of its interval of 95 % (normal, over objects)."""
+    """dB by which found boxes are behind."""
     lost_within: float | None
+    """Half of its interval of 95 % (normal, over objects)."""
 
 
 def known(stored: StoredScene, street: Street) -> dict[int, tuple[str, ...]]:
@@ -250,15 +252,14 @@ def means(records: Iterable[EditRecord]) -> Iterator[Mean]:
         some = list(group)
         by = {tracks: [one for one in some if one.tracks == tracks] for tracks in ("log", "found")}
         lost = np.array([a.psnr - b.psnr for a, b in zip(by["log"], by["found"], strict=True)])
+        ghosts = {tracks: [one.ghost for one in own if one.ghost is not None] for tracks, own in by.items()}
         yield Mean(
             kind,
             edit,
             len(lost),
             {tracks: float(np.mean([one.psnr for one in own])) for tracks, own in by.items()},
             {tracks: float(np.mean([one.psnr_before for one in own])) for tracks, own in by.items()},
-            {tracks: float(np.mean([one.ghost for one in own])) for tracks, own in by.items()}
-            if edit == "removed"
-            else None,
+            {tracks: float(np.median(own)) for tracks, own in ghosts.items() if own},
             float(lost.mean()),
             1.96 * float(lost.std(ddof=1)) / len(lost) ** 0.5 if len(lost) > 1 else None,
         )

@@ -1,5 +1,7 @@
 """Where objects come from: the log, its lidar, or nowhere; and the command that finds them."""
 
+import json
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,11 +13,14 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from sparsestreet.cli.commands.data import data
+from sparsestreet.cli.commands.evaluate import evaluate
 from sparsestreet.cli.commands.train import train
-from sparsestreet.cli.config.compose import composed, option_tree
+from sparsestreet.cli.config.compose import composed, load_run_config, option_tree
 from sparsestreet.cli.config.log_from_options import reader_of
 from sparsestreet.cli.config.targets import made
-from sparsestreet.cli.runs.run import data_of, found_classes
+from sparsestreet.cli.runs.folder import TRACKS_FILE
+from sparsestreet.cli.runs.run import data_of
+from sparsestreet.cli.runs.tracks import found_classes, read_tracks
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.drivestudio import DriveStudioReader
 from sparsestreet.data.drivestudio.annotations import role_of
@@ -28,6 +33,7 @@ from sparsestreet.tracking.scans import Scan
 from sparsestreet.tracking.settings import TrackingSettings
 from sparsestreet.types import Track
 from tests.cli.conftest import TINY_BACKGROUND, TINY_RIGID, street_at
+from tests.cli.test_resume import stopped_at
 from tests.typed import as_a, there
 
 KINDS: dict[str, Kind] = {"Vehicle": "vehicle", "Cyclist": "cyclist", "Pedestrian": "pedestrian"}
@@ -178,6 +184,48 @@ def test_a_wrong_command_is_one_line(words, said, bare, finder, capsys):
     assert said in error
     assert error.startswith("sparsestreet data tracks: ")
     assert error.count("\n") == 1
+
+
+def test_a_run_keeps_what_it_found(tiny_street, finder, tmp_path, capsys):
+    """Stopped, gone on with and measured, it sees the same objects, whatever would be found by then."""
+    options = ["tracks=found", "assignment=all_rigid", "cache=null", "schedule.max_steps=12", "checkpoint_every=5"]
+    run = stopped_at(11, tiny_street, tmp_path / "run", [*TINY_RIGID, *options])
+    cfg, found = load_run_config(run), read_tracks(run, reader_of(composed(tiny_street)).read())
+    for track, each in zip(found, finder.objects, strict=True):
+        assert np.array_equal(track.world_from_object.numpy(), each.world_from_object)  # to the last bit
+    finder.objects, count = (), len(finder.shown)
+    assert train([f"resume={run}"]) == 0
+    assert evaluate([str(run)]) == 0
+    assert len(finder.shown) == count
+    for track, other in zip(data_of(cfg, run).driving_log.tracks, found, strict=True):
+        assert torch.equal(there(track.times), there(other.times))
+        assert (track.name, track.class_name, track.span, track.found) == (
+            other.name, other.class_name, other.span, True,
+        )  # fmt: skip
+    path = run / TRACKS_FILE
+    whole = json.loads(path.read_text())
+    capsys.readouterr()
+    for damage, said in (
+        (lambda first: first["frames"].append(99), "found_1 has frames beyond the 12 of tiny"),
+        (lambda first: first["poses"].pop(), "found_1 lacks a size, a pose of 16 numbers for each frame"),
+        (lambda first: first["poses"][0].__setitem__(0, 2.0), "each pose of object found_1"),
+        (lambda first: first.update(times=None), "found_1 lacks a size, a pose of 16 numbers for each frame, their"),
+        (lambda first: first.update(span=[0.0, math.inf]), "is not strict JSON"),
+        (lambda first: first.update(name="found_2"), "'found_2' stands twice"),
+        (lambda first: first.update(name="found_99"), "the scene has an object found_1 that was not found in tiny"),
+    ):
+        tree = json.loads(json.dumps(whole))
+        damage(tree["tracks"][0])
+        path.write_text(json.dumps(tree))
+        assert evaluate([str(run)]) == 1
+        error = capsys.readouterr().err
+        assert said in error
+        assert error.count("\n") == 1
+    path.unlink()
+    assert evaluate([str(run)]) == 1
+    assert "put back the .hydra/tracks.json of its run, or train it again" in capsys.readouterr().err
+    assert train([*tiny_street, *TINY_RIGID, *options, "tracks=log", "overwrite=true", f"out={run}"]) == 0
+    assert not path.exists()
 
 
 @pytest.mark.slow

@@ -103,7 +103,7 @@ def test_found_boxes_carry_returns_as_annotated_ones_do():
     tracks = tracks_of(plain, [found_of(annotated.tracks[0])], CLASSES)
     own = plain.with_tracks(tracks)
     assert not torch.equal(there(plain.frames[0].depth), there(own.frames[0].depth))
-    assert (own.is_annotated, plain.is_annotated) == (True, False)
+    assert (annotated.is_annotated, plain.is_annotated, own.is_annotated) == (True, False, False)
     split, own_split = (StreetData(log, stride=4, offset=2).driving_log for log in (annotated, own))
     for wanted, got in ((annotated, own), (split, own_split)):
         for one, other in zip(wanted.frames, got.frames, strict=True):

@@ -56,7 +56,7 @@ def _lines(cfg: "DictConfig", to: Path | None) -> "Iterator[str]":
     from dataclasses import replace
 
     from sparsestreet.cli.config.targets import made
-    from sparsestreet.cli.runs.run import found_classes, joins
+    from sparsestreet.cli.runs.tracks import found_classes, joins
     from sparsestreet.kept import Kept
     from sparsestreet.pictures.from_above import kinds_in_words
     from sparsestreet.tracking.street import assumptions, check_lidar, found_objects, joined, tracks_of
