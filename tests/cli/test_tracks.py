@@ -224,6 +224,7 @@ def test_a_run_keeps_what_it_found(tiny_street, finder, tmp_path, capsys):
     path.unlink()
     assert evaluate([str(run)]) == 1
     assert "put back the .hydra/tracks.json of its run, or train it again" in capsys.readouterr().err
+    path.write_text(json.dumps(whole))
     assert train([*tiny_street, *TINY_RIGID, *options, "tracks=log", "overwrite=true", f"out={run}"]) == 0
     assert not path.exists()
 
