@@ -168,15 +168,16 @@ def _returns(
 
 
 def _tile(log: "DrivingLog", each: "FoundObject", track: "Track") -> "Tile | None":
-    """The object in the image that shows it best; None where none shows its middle."""
+    """The object in the image that shows it best: large, and with many returns, so not hidden. None where none shows its
+    middle."""
     from sparsestreet.pictures.from_above import box_in_image
     from sparsestreet.pictures.sheets import Tile
 
     best, shown = None, 0.0
     returns = dict(zip(each.frames.tolist(), each.returns.tolist(), strict=True))
     for place, view in enumerate(log.views):
-        if returns.get(view.indices[0], 0) and (corners := _corners_in(view, track)) is not None:
-            score = _shown(corners, (view.camera.width, view.camera.height))
+        if (count := returns.get(view.indices[0], 0)) and (corners := _corners_in(view, track)) is not None:
+            score = count * _shown(corners, (view.camera.width, view.camera.height))
             best, shown = ((place, corners), score) if score > shown else (best, shown)
     if best is None:
         return None

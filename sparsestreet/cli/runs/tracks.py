@@ -41,6 +41,9 @@ def with_tracks(cfg: DictConfig, log: DrivingLog, run: Path | None = None) -> Dr
     if asked["name"] == "log":
         said = "%s has no boxes: objects are found in its lidar (tracks=found; tracks=none goes without)"
         _log.info(said, log.name)
+    elif not _has_objects(cfg):
+        said = "method=%s has no objects: found ones only carry returns to the instants of images"
+        _log.info(said, cfg.method.name)
     own = log.tracks if joins(cfg) else ()
     if run is not None and (run / TRACKS_FILE).exists():
         return log.with_tracks((*own, *read_tracks(run, log)))
