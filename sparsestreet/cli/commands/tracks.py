@@ -168,8 +168,7 @@ def _returns(
 
 
 def _tile(log: "DrivingLog", each: "FoundObject", track: "Track") -> "Tile | None":
-    """The object in the image that shows it best: large, and with many returns, so not hidden. None where none shows its
-    middle."""
+    """The object in the image that shows it best: large and, having many returns, not hidden. None where none does."""
     from sparsestreet.pictures.from_above import box_in_image
     from sparsestreet.pictures.sheets import Tile
 
