@@ -245,6 +245,7 @@ def test_found_boxes_are_seen_as_annotated_ones(tiny_street, finder):
     assert torch.equal(terms[0].street.points, terms[1].street.points)
 
 
+@pytest.mark.slow
 def test_held_out_sweeps_lend_nothing(tmp_path):
     """The search itself, in a street whose held-out sweep is another street's: boxes and objects are the same."""
     words = [word for word in street_at(tmp_path / "street") if not word.startswith("data.lidar")]
