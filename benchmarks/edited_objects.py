@@ -139,7 +139,7 @@ class EditRecord:
     street: int
     """Its seed."""
     actor: str
-    kind: str
+    class_name: str
     edit: str
     tracks: str
     """log or found: where the object's boxes came from."""
@@ -160,7 +160,8 @@ class EditRecord:
 class Mean:
     """Means over the objects that scenes with either kind of boxes have."""
 
-    kind: str
+    class_name: str
+    """all: of any class."""
     edit: str
     objects: int
     psnr: dict[str, float]
@@ -234,27 +235,22 @@ def measured(street: Street, scenes: Mapping[str, StoredScene]) -> Iterator[Edit
                 other = replace(stored, scene=edited(stored.scene, edits_of(edit, names)))
                 psnr, before, ghost = compared(stored, other, regions)
                 yield EditRecord(
-                    street.settings.seed, actor.name, kind_of(actor), edit, tracks, names, len(regions), pixels,
+                    street.settings.seed, actor.name, actor.model.class_name, edit, tracks, names, len(regions), pixels,
                     psnr, before, ghost if edit == "removed" else None,
                 )  # fmt: skip
 
 
-def kind_of(actor: Actor) -> str:
-    """Return what an actor is, in the words of found objects."""
-    return actor.model.class_name.lower()
-
-
 def means(records: Iterable[EditRecord]) -> Iterator[Mean]:
-    """Yield the mean of each kind and edit, and that of all kinds."""
+    """Yield the mean of each class and edit, and that of all classes."""
     every = list(records)
-    rows = sorted([*every, *(replace(one, kind="all") for one in every)], key=lambda one: (one.kind, one.edit))
-    for (kind, edit), group in groupby(rows, key=lambda one: (one.kind, one.edit)):
+    rows = sorted([*every, *(replace(one, class_name="all") for one in every)], key=_of_mean)
+    for (class_name, edit), group in groupby(rows, key=_of_mean):
         some = list(group)
         by = {tracks: [one for one in some if one.tracks == tracks] for tracks in ("log", "found")}
         lost = np.array([a.psnr - b.psnr for a, b in zip(by["log"], by["found"], strict=True)])
         ghosts = {tracks: [one.ghost for one in own if one.ghost is not None] for tracks, own in by.items()}
         yield Mean(
-            kind,
+            class_name,
             edit,
             len(lost),
             {tracks: float(np.mean([one.psnr for one in own])) for tracks, own in by.items()},
@@ -263,6 +259,10 @@ def means(records: Iterable[EditRecord]) -> Iterator[Mean]:
             float(lost.mean()),
             1.96 * float(lost.std(ddof=1)) / len(lost) ** 0.5 if len(lost) > 1 else None,
         )
+
+
+def _of_mean(one: EditRecord) -> tuple[str, str]:
+    return one.class_name, one.edit
 
 
 USAGE = """\
