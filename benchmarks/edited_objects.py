@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -27,8 +28,7 @@ from sparsestreet.data.synthetic import StreetReader
 from sparsestreet.data.synthetic.reader import street_truth
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.tracer import Pose, at
-from sparsestreet.data.synthetic.world import Actor, Way, World, build_world
-from sparsestreet.geometry.cameras import project
+from sparsestreet.data.synthetic.world import Way, World, build_world
 from sparsestreet.scene.edits import REMOVED, Added, Change, Edits, Moved, edited
 from sparsestreet.scene.edits.edits import objects_of
 from sparsestreet.scene.edits.nodes import recorded_frames
@@ -46,7 +46,6 @@ VISIBLE = 3 / 255
 NEAR = 1.5
 """Meters in plan between an object and the actor that it is, most: an end that nobody saw is a guess."""
 EDITS = ("removed", "moved", "copied")
-
 Image = Float64[np.ndarray, "h w 3"]
 
 
@@ -55,15 +54,12 @@ class Beside(Way):
     """An actor's path, moved to its right."""
 
     path: Way
-    right: float
 
     def traveled(self, time: float) -> float:
-        """Return meters that its wheels or legs have moved since time 0."""
         return self.path.traveled(time)
 
     def pose(self, time: float, height: float) -> Pose:
-        """Return world from object, with the object's origin ``height`` meters above the road."""
-        return self.path.pose(time, height) @ at(0.0, -self.right, 0.0)
+        return self.path.pose(time, height) @ at(0.0, -RIGHT, 0.0)
 
 
 @dataclass(frozen=True)
@@ -87,7 +83,7 @@ class Street:
     def regions(self, edit: str, number: int) -> list["Region"]:
         """Return where an edit of an actor changes most."""
         actors = list(self.world.actors)
-        beside = replace(actors[number], path=Beside(actors[number].path, RIGHT))
+        beside = replace(actors[number], path=Beside(actors[number].path))
         actors[number : number + 1] = {"removed": [], "moved": [beside], "copied": [actors[number], beside]}[edit]
         seen = [place for place, view in enumerate(self.views) if self._may_show(view, number)]
         after = self._traced(replace(self.world, actors=tuple(actors)), [self.views[place] for place in seen])
@@ -100,26 +96,20 @@ class Street:
                     regions.append(Region(self.views[place], before, image, changed))
         return sorted(regions, key=lambda one: -one.changed.sum())[:VIEWS]
 
-    def seconds(self, time: float) -> float:
-        """Return the street's clock at a normalized time."""
+    def place(self, number: int, time: float) -> Pose:
+        """Return where an actor is at a normalized time, in the street's own world."""
         first, last = self.settings.recorded
-        return first + time * (last - first)
+        return self.world.actors[number].pose(first + time * (last - first))
 
     def _traced(self, world: World, views: Sequence[View]) -> Iterator[Image | None]:
         truth = street_truth(self.settings, self.street_from_world, world)
         for view in views:
-            frame = truth(view)
-            yield None if frame is None else frame.image.double().numpy() / 255
+            yield None if (frame := truth(view)) is None else frame.image.double().numpy() / 255
 
     def _may_show(self, view: View, number: int) -> bool:
-        """Whether the actor is before the camera, where it was or beside, or in the margin that its size fills."""
-        pose = self.world.actors[number].pose(self.seconds(view.time))
-        places = torch.from_numpy(np.stack([pose[:3, 3], pose[:3, 3] - RIGHT * pose[:3, 1]]))
-        inverse = torch.linalg.inv(self.street_from_world)
-        pixels, depth, _ = project(view.camera, places @ inverse[:3, :3].T + inverse[:3, 3])
-        margin = view.camera.width * 3.0 / depth.clamp(min=1.0)
-        low, high = -margin, view.camera.width + margin
-        return bool(((depth > 0) & (pixels[:, 0] > low) & (pixels[:, 0] < high)).any())
+        """Whether the actor is ahead of the camera."""
+        place = torch.linalg.solve(self.street_from_world, torch.from_numpy(self.place(number, view.time)[:, 3]))
+        return float(view.camera.camera_from_world[2].double() @ place) > 0
 
 
 @dataclass(frozen=True)
@@ -142,26 +132,25 @@ class EditRecord:
     class_name: str
     edit: str
     tracks: str
-    """log or found: where the object's boxes came from."""
+    """log or found."""
     names: tuple[str, ...]
     """Of the scene's objects that are the actor."""
     views: int
     pixels: int
-    """That the edit changes, in all of these views."""
+    """That the edit changes."""
     psnr: float
-    """There, of the edited scene beside the street traced with the edit, dB."""
+    """There, dB: of the edited scene beside the street traced with the edit."""
     psnr_before: float
-    """There, of the scene beside the street as they were, dB."""
+    """Of both as they were."""
     ghost: float | None
     """Energy of what is left of the object, as a share of its own; None: nothing was taken away."""
 
 
 @dataclass(frozen=True)
 class Mean:
-    """Means over the objects that scenes with either kind of boxes have."""
+    """Means over the objects that both scenes have."""
 
     class_name: str
-    """all: of any class."""
     edit: str
     objects: int
     psnr: dict[str, float]
@@ -170,9 +159,8 @@ class Mean:
     ghost: dict[str, float]
     """Medians; none where nothing was taken away."""
     lost: float
-    """dB by which found boxes are behind."""
+    """dB by which found boxes are behind, and half of its interval of 95 % (normal, over objects)."""
     lost_within: float | None
-    """Half of its interval of 95 % (normal, over objects)."""
 
 
 def known(stored: StoredScene, street: Street) -> dict[int, tuple[str, ...]]:
@@ -183,7 +171,8 @@ def known(stored: StoredScene, street: Street) -> dict[int, tuple[str, ...]]:
         start, end = node.spans[instance].tolist()
         time = min(max((start + end) / 2, 0.0), 1.0)
         place = matrix @ recorded_frames(node, instance)(time)[:, 3]
-        gaps = [np.linalg.norm(one.pose(street.seconds(time))[:2, 3] - place[:2]) for one in street.world.actors]
+        places = [street.place(number, time)[:2, 3] for number in range(len(street.world.actors))]
+        gaps = [np.linalg.norm(one - place[:2]) for one in places]
         if min(gaps) < NEAR:
             names.setdefault(int(np.argmin(gaps)), []).append(name)
     return {number: tuple(some) for number, some in names.items()}
@@ -199,26 +188,15 @@ def edits_of(edit: str, names: Sequence[str]) -> Edits:
 @torch.no_grad()
 def compared(scene: StoredScene, other: StoredScene, regions: Sequence[Region]) -> tuple[float, float, float]:
     """Return PSNR of an edited scene, that of the unedited one in the same pixels, and the ghost."""
-    errors, old_errors, alike, own = 0.0, 0.0, 0.0, 0.0
+    parts: list[list[Float64[np.ndarray, "n 3"]]] = [[], [], []]
     for region in regions:
-        error = (rendered(other, region.view) - region.after)[region.changed]
-        thing = (region.before - region.after)[region.changed]
-        errors += float((error**2).sum())
-        old_errors += float(((rendered(scene, region.view) - region.before)[region.changed] ** 2).sum())
-        alike += float((error * thing).sum())
-        own += float((thing**2).sum())
-    pixels = sum(int(region.changed.sum()) for region in regions)
-    return decibels(errors, pixels), decibels(old_errors, pixels), (max(alike, 0.0) / own) ** 2
-
-
-def rendered(stored: StoredScene, view: View) -> Image:
-    """Return the image of a scene."""
-    return stored.render(view).rgb.clamp(0, 1).double().cpu().numpy()
-
-
-def decibels(squared: float, pixels: int) -> float:
-    """Return PSNR of a sum of squared differences over pixels of three colors."""
-    return float(-10 * np.log10(squared / (3 * pixels)))
+        new, old = (one.render(region.view).rgb.clamp(0, 1).double().cpu().numpy() for one in (other, scene))
+        differences = new - region.after, old - region.before, region.before - region.after
+        for part, image in zip(parts, differences, strict=True):
+            part.append(image[region.changed])
+    error, old_error, thing = map(np.concatenate, parts)
+    psnr, before = (float(-10 * np.log10((one**2).mean())) for one in (error, old_error))
+    return psnr, before, float((max((error * thing).sum(), 0.0) / (thing**2).sum()) ** 2)
 
 
 def measured(street: Street, scenes: Mapping[str, StoredScene]) -> Iterator[EditRecord]:
@@ -243,8 +221,9 @@ def measured(street: Street, scenes: Mapping[str, StoredScene]) -> Iterator[Edit
 def means(records: Iterable[EditRecord]) -> Iterator[Mean]:
     """Yield the mean of each class and edit, and that of all classes."""
     every = list(records)
-    rows = sorted([*every, *(replace(one, class_name="all") for one in every)], key=_of_mean)
-    for (class_name, edit), group in groupby(rows, key=_of_mean):
+    key = attrgetter("class_name", "edit")
+    rows = sorted([*every, *(replace(one, class_name="all") for one in every)], key=key)
+    for (class_name, edit), group in groupby(rows, key=key):
         some = list(group)
         by = {tracks: [one for one in some if one.tracks == tracks] for tracks in ("log", "found")}
         lost = np.array([a.psnr - b.psnr for a, b in zip(by["log"], by["found"], strict=True)])
@@ -259,10 +238,6 @@ def means(records: Iterable[EditRecord]) -> Iterator[Mean]:
             float(lost.mean()),
             1.96 * float(lost.std(ddof=1)) / len(lost) ** 0.5 if len(lost) > 1 else None,
         )
-
-
-def _of_mean(one: EditRecord) -> tuple[str, str]:
-    return one.class_name, one.edit
 
 
 USAGE = """\
@@ -304,12 +279,7 @@ def write(request: EditsRequest, file: RecordFile) -> None:
         for one in measured(street, scenes):
             records.append(one)
             file.write("edit", one)
-            ghost = "" if one.ghost is None else f", ghost {100 * one.ghost:.2f} %"
-            print(
-                f"{one.street} {one.actor:15} {one.edit:8} {one.tracks:6} {one.psnr:5.1f} dB (unedited "
-                f"{one.psnr_before:.1f}) in {one.pixels:,} pixels of {one.views} views{ghost}",
-                flush=True,
-            )
+            print(one, flush=True)
     for mean in means(records):
         file.write("mean", mean)
         print(mean)
