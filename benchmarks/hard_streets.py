@@ -259,8 +259,8 @@ def recorded(world: World, settings: StreetSettings, mounts: Mounts = OneLidar) 
     return scans, true_boxes(world, settings, scans)
 
 
-SECTORS = 16
-"""Parts of a turn, each of one instant: what drives 25 m/s jumps by 0.16 m from one to the next."""
+SECTORS = 8
+"""Parts of a turn, each of one instant: what drives 10 m/s jumps by 0.13 m from one to the next."""
 
 
 def spun(world: World, settings: StreetSettings) -> Seen:

@@ -88,10 +88,10 @@ def headings(
 ) -> tuple[Float64[np.ndarray, " s"], Float64[np.ndarray, " s"]]:
     """Return yaw in radians, unwrapped, and speed in meters per second at each step of a path.
 
-    Yaw is the direction of motion, over ``reach`` seconds ahead and behind, where it is faster than ``min_speed``, or than half its fastest if it is always slow.
-    Elsewhere it lies between that before and behind, since the direction of what stands is noise. A path of one step
-    has yaw 0. What ``reverses`` does not turn about while it stands: where its direction then jumps by more than a
-    right angle it goes backwards, and forwards is where it is fastest.
+    Yaw is the direction of motion, over ``reach`` seconds ahead and behind, where it is faster than ``min_speed``, or
+    than half its fastest if it is always slow. Elsewhere it lies between that before and behind, since the direction of
+    what stands is noise. A path of one step has yaw 0. What ``reverses`` does not turn about while it stands: where its
+    direction then jumps by more than a right angle it goes backwards, and forwards is where it is fastest.
     """
     number = np.arange(len(path))
     ahead = np.searchsorted(seconds, seconds + reach + 1e-6, side="right") - 1
