@@ -112,7 +112,8 @@ class Matches:
         for frame in frames:
             rows = [k for k, one in enumerate(truth) if frame in one.poses]
             columns = [k for k, one in enumerate(found) if frame in one.poses]
-            gain = np.array([[gained(truth[r], found[c], frame) for c in columns] for r in rows]).reshape(len(rows), -1)
+            gain = np.array([[gained(truth[r], found[c], frame) for c in columns] for r in rows])
+            gain = gain.reshape(len(rows), len(columns))  # either may be none
             for r, c in zip(*linear_sum_assignment(-gain), strict=True):
                 if gain[r, c] > 0:
                     pairs.append((frame, rows[r], columns[c]))
