@@ -1,5 +1,6 @@
 """The parts of the search, beside brute force and beside dense float64 solutions."""
 
+from functools import partial
 from math import factorial
 
 import numpy as np
@@ -10,6 +11,7 @@ from sparsestreet.tracking.clusters import Cluster, cluster_labels, find_cluster
 from sparsestreet.tracking.fit import fit, laid_on_each_other
 from sparsestreet.tracking.free_space import count_views, seen_through
 from sparsestreet.tracking.ground import find_ground
+from sparsestreet.tracking.joining import join_chains
 from sparsestreet.tracking.objects import FoundObject, upright_poses
 from sparsestreet.tracking.path import BEND, headings, in_frame, smooth, turned
 from sparsestreet.tracking.scans import Returns, Scan, instants
@@ -194,6 +196,21 @@ def test_the_heading_of_what_is_long_is_taken_over_its_length():
     assert found.shape.size[0] == pytest.approx(12.1, abs=0.2)
     assert np.degrees(np.abs(found.yaw)).max() < 5
     assert np.abs(found.path[:, 1]).max() < 0.8  # the middle of what is seen jumps by 1.25 m
+
+
+@pytest.mark.parametrize(("behind", "beside", "count"), [(6.6, 0.0, 1), (6.6, 2.5, 2), (8.5, 0.0, 2)])
+def test_pieces_in_line_are_one_and_those_abreast_or_apart_are_two(behind, beside, count):
+    """Boxes of 6 x 2.5 m that keep their places while they drive askew to the axes: a tram between its windows."""
+    yaw, seconds = 2.2, np.arange(30) * 0.1
+    sides = [[x, y, z] for x in np.linspace(-3, 3, 25) for y in (-1.25, 1.25) for z in (0.5, 2.5)]
+    box = np.array([*sides, *([x, y, 1.5] for x in (-3, 3) for y in np.linspace(-1.25, 1.25, 11))])
+    chains = []
+    for shift in np.array(((0, 0, 0), (-behind, beside, 0))):
+        places = [box + shift + np.array((5 * time, 0, 0)) for time in seconds]
+        turns = [np.column_stack((turned(points[:, :2], np.full(len(points), yaw)), points[:, 2])) for points in places]
+        chains.append(Chain(np.arange(30), tuple(returns_of(points, (0.0, -9.0, 1.8)) for points in turns)))
+    fitted = partial(fit, seconds=seconds, ground=find_ground([np.zeros((1, 3))]), refine=False)
+    assert len(join_chains(chains, fitted, seconds, TrackingSettings())) == count
 
 
 def test_the_road_is_found_below_walls_cars_and_reflections():
