@@ -82,7 +82,7 @@ class DrivingLog:
     sweeps: Sweeps
     """Ordered by index, read when indexed; ``Sweeps.of(())`` where the log has no lidar."""
     tracks: tuple[Track, ...]
-    """Objects annotated in at least one of the frames; poses are in the re-centered world."""
+    """Objects with a box in at least one of the frames; poses are in the re-centered world."""
     num_frames: int
     """Instants, not images: frame indices run over 0 .. num_frames - 1."""
     num_cameras: int
@@ -105,6 +105,8 @@ class DrivingLog:
     """Makes frames and sweeps whose points these objects carry from one time to another; those of instants that are not
     held out depend on no box of one that is. None: no box carries a point."""
 
+    is_annotated: bool = True
+    """Whether somebody has looked for objects in it, though there may be none."""
     vehicle: VehiclePath | None = None
     """None: the log tells where its cameras were, but not the car that carried them."""
     kept: Kept = field(default=NOTHING, compare=False)
@@ -138,11 +140,6 @@ class DrivingLog:
             return others
         frames, sweeps = self.carried_by(tracks, frozenset())
         return replace(others, frames=frames, sweeps=sweeps)
-
-    @property
-    def is_annotated(self) -> bool:
-        """Whether somebody has looked for objects in it, though there may be none."""
-        return _ABSENT["boxes"] not in self.notes
 
     hoods: Mapping[int, Hood] = field(default_factory=dict)
     """Camera index -> what it was found to see of the car that carries it (``hood.find_hoods``)."""

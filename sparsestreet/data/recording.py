@@ -362,6 +362,7 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
         dataset_from_world=dataset_from_world(origin),
         carried_by=folder.carried_by,
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
+        is_annotated=recording.boxes is not None,
         vehicle=_vehicle(recording.vehicle, origin),
         notes=(
             *_absent(recording),

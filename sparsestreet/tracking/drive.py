@@ -72,7 +72,7 @@ def look(
 def _candidates(scan: Scan, ground: Ground, settings: TrackingSettings) -> Float64[np.ndarray, "k 3"]:
     """The returns of a scan above the road, one a small cell."""
     height = scan.points[:, 2] - ground.below(scan.points)
-    points = scan.points[(height > settings.lowest) & (height < settings.highest)]
+    points = scan.points[(height > settings.lowest) & (height < settings.highest)].astype(np.float64)
     return points[np.sort(np.unique(packed(points, THIN), return_index=True)[1])]
 
 

@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 from jaxtyping import Float64, Int64
+from scipy.spatial.distance import pdist
 
 from sparsestreet.tracking.association import Chain, associate
 from sparsestreet.tracking.clusters import find_clusters
@@ -82,9 +83,14 @@ def _objects(
 
 
 def _moves(chain: Chain) -> bool:
-    """Whether the last returns lie elsewhere than the first."""
-    first, last = (part.points[:, :2].mean(0) for part in (chain.parts[0], chain.parts[-1]))
-    return bool(np.linalg.norm(last - first) > 0.5)
+    """Whether any returns lie elsewhere than the first."""
+    places = np.array([part.points[:, :2].mean(0) for part in chain.parts])
+    return bool(_farthest(places) > 0.5)
+
+
+def _farthest(path: Float64[np.ndarray, "n 2"]) -> float:
+    """How far its places lie apart, meters: what reverses comes back to its first one."""
+    return float(pdist(path).max(initial=0.0))
 
 
 MAX_ERROR = 0.5
@@ -107,7 +113,7 @@ def _is_object(found: Fit, seconds: Float64[np.ndarray, " t"], settings: Trackin
     going = found.speed >= MIN_SPEED
     steps = np.linalg.norm(np.diff(found.path, axis=0), axis=1)
     walked = steps[going[1:] | going[:-1]].sum()
-    moved = np.linalg.norm(found.path[-1] - found.path[0])
+    moved = _farthest(found.path)
     mean_speed = walked / (seconds[found.steps[-1]] - seconds[found.steps[0]])
     goes = moved > least and moved > MIN_STRAIGHT * walked and mean_speed < settings.max_speed
     clear = found.error < MAX_ERROR and (found.counts > 0).mean() > MIN_SEEN
@@ -131,13 +137,17 @@ def _apart(objects: Sequence[_Object], drive: Sequence[Instant]) -> list[_Object
 
 
 def _within(one: Fit, other: Fit, drive: Sequence[Instant]) -> bool:
-    both = np.intersect1d(one.steps, other.steps).tolist()
-    if len(both) < MIN_COMMON * len(one.steps):
+    both = np.arange(max(one.steps[0], other.steps[0]), min(one.steps[-1], other.steps[-1]) + 1)
+    if len(both) < max(1, MIN_COMMON * len(one.steps)):
         return False
-    own = [drive[step].inside(one.at(step), COUNT_MARGIN) for step in both]
+    gaps = np.linalg.norm(one.path[both - one.steps[0]] - other.path[both - other.steps[0]], axis=1)
+    reach = sum(float(np.linalg.norm(each.shape.size[:2] / 2 + COUNT_MARGIN)) for each in (one, other))
+    if gaps.min() > reach:  # their boxes do not touch: most do not
+        return False
+    own = [drive[step].inside(one.at(step), COUNT_MARGIN) for step in both.tolist()]
     shared = [
         np.intersect1d(rows, drive[step].inside(other.at(step), COUNT_MARGIN))
-        for step, rows in zip(both, own, strict=True)
+        for step, rows in zip(both.tolist(), own, strict=True)
     ]
     return sum(map(len, shared)) > MAX_SHARED * sum(map(len, own))
 

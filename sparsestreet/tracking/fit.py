@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -10,7 +11,7 @@ from scipy.spatial import KDTree
 from sparsestreet.tracking.association import Chain
 from sparsestreet.tracking.ground import Ground
 from sparsestreet.tracking.objects import Kind
-from sparsestreet.tracking.path import MIN_SPEED, headings, in_frame, smooth, turned
+from sparsestreet.tracking.path import HEADING_REACH, MIN_SPEED, headings, in_frame, smooth, turned
 from sparsestreet.tracking.scans import Returns
 from sparsestreet.tracking.shape import Shape, find_middles, find_shape, outlines
 
@@ -20,6 +21,8 @@ FIRST_STIFFNESS, STIFFNESS, HEIGHT_STIFFNESS = 30.0, 60.0, 100.0
 """Of the path through middles of clusters, of the path through middles of boxes, and of heights (``path.smooth``)."""
 TURNING_SPEEDS: dict[Kind, float] = {"vehicle": 1.0, "cyclist": 1.0, "pedestrian": MIN_SPEED}
 """Meters per second, below which the heading is held: what has wheels does not move sideways, its noise does."""
+MAX_REACH = 2.0
+"""Seconds, the longest over which a heading is taken to both sides."""
 MANY_RETURNS = 20
 """Returns of an instant with the full weight."""
 
@@ -75,23 +78,26 @@ def fit(chain: Chain, seconds: Float64[np.ndarray, " t"], ground: Ground, *, ref
     middles = np.array([np.quantile(part.points[:, :2], (0.02, 0.98), axis=0).mean(0) for part in parts])
     tops = np.array([np.quantile(part.points[:, 2], 0.98) for part in parts]) - ground.below(middles)
     path = smooth(steps, middles, weights, seconds, FIRST_STIFFNESS)
-    turning = MIN_SPEED
+    turn = partial(headings, seconds=own, min_speed=MIN_SPEED)
     for _ in range(ROUNDS):
-        yaw, speed = headings(path, own, turning)
+        yaw, speed = turn(path)
         outline = outlines(parts, path[at], yaw[at])
-        shape = find_shape(
-            outline,
-            counts,
-            float(np.quantile(tops, 0.8)),
-            float(np.median(speed[speed >= min(MIN_SPEED, speed.max())])),
+        usual_speed = float(np.median(speed[speed >= min(MIN_SPEED, speed.max())]))
+        shape = find_shape(outline, counts, float(np.quantile(tops, 0.8)), usual_speed)
+        turn = partial(
+            headings,
+            seconds=own,
+            min_speed=TURNING_SPEEDS[shape.kind],
+            reverses=shape.kind == "vehicle",
+            # What is long turns slowly: its direction is that over its own length.
+            reach=max(HEADING_REACH, min(MAX_REACH, shape.size[0] / 2 / max(usual_speed, MIN_SPEED))),
         )
-        turning = TURNING_SPEEDS[shape.kind]
         middles, sure = find_middles(parts, outline, shape, path[at], yaw[at])
         path = smooth(steps, middles, weights * sure, seconds, STIFFNESS)
     if refine:
-        shifts = laid_on_each_other(parts, path[at], headings(path, own, turning)[0][at], weights)
+        shifts = laid_on_each_other(parts, path[at], turn(path)[0][at], weights)
         path = smooth(steps, path[at] + shifts, weights, seconds, STIFFNESS)
-    yaw, speed = headings(path, own, turning)
+    yaw, speed = turn(path)
     every = np.arange(steps[0], steps[-1] + 1)
     bottom = smooth(every, ground.below(path)[:, None], np.ones(len(every)), seconds, HEIGHT_STIFFNESS)[:, 0]
     seen = np.zeros(len(every), np.int64)

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float64
 from scipy import ndimage
 
 CELL = 0.5
@@ -27,14 +27,14 @@ class Ground:
     corner: Float64[np.ndarray, "2"]
     """Where the first cell begins."""
 
-    def below(self, places: Float64[np.ndarray, "n d"]) -> Float64[np.ndarray, " n"]:
+    def below(self, places: Float[np.ndarray, "n d"]) -> Float64[np.ndarray, " n"]:
         """Return the height of the road below places, of which x and y count."""
         cells = ((places[:, :2] - self.corner) / CELL).astype(np.int64)
         cells = np.clip(cells, 0, np.array(self.heights.shape) - 1)
         return self.heights[cells[:, 0], cells[:, 1]]
 
 
-def find_ground(scans: Iterable[Float64[np.ndarray, "n 3"]]) -> Ground:
+def find_ground(scans: Iterable[Float[np.ndarray, "n 3"]]) -> Ground:
     """Return the heights below the returns of scans; a flat map at 0 where there are none."""
     lows = np.concatenate([np.zeros((0, 3)), *map(_lowest_of_cells, scans)])
     if not len(lows):
@@ -51,7 +51,7 @@ def find_ground(scans: Iterable[Float64[np.ndarray, "n 3"]]) -> Ground:
     return Ground(_without_what_stands(heights - plane) + plane, corner)
 
 
-def _lowest_of_cells(points: Float64[np.ndarray, "n 3"]) -> Float64[np.ndarray, "k 3"]:
+def _lowest_of_cells(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "k 3"]:
     """The lowest return of each cell of one scan, so that a scan has one voice a cell however dense it is."""
     if not len(points):
         return points

@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 
 from sparsestreet.tracking.association import YOUNG, Chain
 from sparsestreet.tracking.fit import Fit
-from sparsestreet.tracking.path import in_frame
+from sparsestreet.tracking.path import turned
 from sparsestreet.tracking.settings import TrackingSettings
 
 END = 8
@@ -47,16 +47,17 @@ def join_chains(
     """
     pieces = [_Piece(chain, fitted(chain), number) for number, chain in enumerate(chains)]
     cost = partial(_cost, seconds=seconds, settings=settings)
-    costs = {(a.number, b.number): cost(a.fit, b.fit) for a in pieces for b in pieces if a is not b}
-    while costs and (best := min((value, pair) for pair, value in costs.items()))[0] < np.inf:
+    pairs = [(a, b) for a in pieces for b in pieces if a is not b]
+    costs = {(a.number, b.number): value for a, b in pairs if (value := cost(a.fit, b.fit)) < np.inf}
+    while costs:
+        best = min((value, pair) for pair, value in costs.items())
         both = [piece for piece in pieces if piece.number in best[1]]
         chain = Chain.merged([piece.chain for piece in both])
         new = _Piece(chain, fitted(chain), max(piece.number for piece in pieces) + 1)
         pieces = [piece for piece in pieces if piece.number not in best[1]]
         costs = {pair: value for pair, value in costs.items() if not set(pair) & set(best[1])}
-        for other in pieces:
-            costs[other.number, new.number] = cost(other.fit, new.fit)
-            costs[new.number, other.number] = cost(new.fit, other.fit)
+        pairs = [pair for other in pieces for pair in ((other, new), (new, other))]
+        costs |= {(a.number, b.number): value for a, b in pairs if (value := cost(a.fit, b.fit)) < np.inf}
         pieces.append(new)
     return [piece.chain for piece in pieces]
 
@@ -66,7 +67,7 @@ def _cost(a: Fit, b: Fit, *, seconds: Float64[np.ndarray, " t"], settings: Track
     gap = float(seconds[b.steps[0]] - seconds[a.steps[-1]])
     if gap > 0:
         return _behind(a, b, gap, seconds) if gap < settings.max_lost else np.inf
-    both = np.intersect1d(a.steps, b.steps)
+    both = np.arange(max(a.steps[0], b.steps[0]), min(a.steps[-1], b.steps[-1]) + 1)
     seen = both[(a.counts[both - a.steps[0]] > 0) & (b.counts[both - b.steps[0]] > 0)]
     shorter = min(len(a.steps), len(b.steps))
     return _beside(a, b, seen) if len(seen) >= max(YOUNG, SHARED * shorter) else np.inf
@@ -92,8 +93,7 @@ def _beside(a: Fit, b: Fit, both: Int64[np.ndarray, " k"]) -> float:
     path, other = a.path[both - a.steps[0]], b.path[both - b.steps[0]]
     yaw = a.yaw[both - a.steps[0]]
     moved = float(np.linalg.norm(path[-1] - path[0]))
-    relative = np.array([in_frame(q[None], p, angle)[0] for q, p, angle in zip(other, path, yaw, strict=True)])
-    along, across = np.median(np.abs(relative), axis=0)
+    along, across = np.median(np.abs(turned(other - path, -yaw)), axis=0)
     lengths = a.shape.size[0], b.shape.size[0]
     is_long = max(lengths) > LONG
     space = along - sum(lengths) / 2

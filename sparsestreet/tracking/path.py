@@ -16,7 +16,7 @@ BEND = 2.0
 """Weight of the penalty on accelerations. It is nothing beside measured places, but where there are none, or hardly
 any, the path goes straight on."""
 HEADING_REACH = 0.5
-"""Seconds ahead and behind between which the direction of motion is taken."""
+"""Seconds ahead and behind between which the direction of motion is usually taken."""
 MIN_SPEED = 0.4
 """Meters per second, below which a thing stands."""
 
@@ -79,24 +79,33 @@ def _penalty(seconds: Float64[np.ndarray, " s"], order: int) -> Float64[np.ndarr
 
 
 def headings(
-    path: Float64[np.ndarray, "s 2"], seconds: Float64[np.ndarray, " s"], min_speed: float
+    path: Float64[np.ndarray, "s 2"],
+    seconds: Float64[np.ndarray, " s"],
+    min_speed: float,
+    *,
+    reach: float = HEADING_REACH,
+    reverses: bool = False,
 ) -> tuple[Float64[np.ndarray, " s"], Float64[np.ndarray, " s"]]:
     """Return yaw in radians, unwrapped, and speed in meters per second at each step of a path.
 
-    Yaw is the direction of motion where it is faster than ``min_speed``, or than half its fastest if it is always slow.
-    Elsewhere it lies between that before and behind, since the direction of what stands is noise. A path of one step
-    has yaw 0.
+    Yaw is the direction of motion, over ``reach`` seconds ahead and behind, where it is faster than ``min_speed``, or
+    than half its fastest if it is always slow. Elsewhere it lies between that before and behind, since the direction of
+    what stands is noise. A path of one step has yaw 0. What ``reverses`` does not turn about while it stands: where its
+    direction then jumps by more than a right angle it goes backwards, and forwards is where it is fastest.
     """
     number = np.arange(len(path))
-    ahead = np.searchsorted(seconds, seconds + HEADING_REACH + 1e-6, side="right") - 1
-    behind = np.searchsorted(seconds, seconds - HEADING_REACH - 1e-6)
+    ahead = np.searchsorted(seconds, seconds + reach + 1e-6, side="right") - 1
+    behind = np.searchsorted(seconds, seconds - reach - 1e-6)
     ahead, behind = np.maximum(ahead, number + 1), np.minimum(behind, number - 1)
     ahead, behind = np.minimum(ahead, len(path) - 1), np.maximum(behind, 0)
     moved = path[ahead] - path[behind]
     speed = np.linalg.norm(moved, axis=1) / np.maximum(seconds[ahead] - seconds[behind], 1e-6)
     sure = np.flatnonzero(speed >= min(min_speed, speed.max() / 2))
-    yaw = np.unwrap(np.arctan2(moved[sure, 1], moved[sure, 0]))
-    return np.interp(number, sure, yaw), speed
+    yaw = np.arctan2(moved[sure, 1], moved[sure, 0])
+    if reverses:
+        ways = np.cumprod(np.append(1.0, np.where(np.cos(np.diff(yaw)) < 0, -1.0, 1.0)))
+        yaw += np.pi * (ways != ways[np.argmax(speed[sure])])
+    return np.interp(number, sure, np.unwrap(yaw)), speed
 
 
 def in_frame(

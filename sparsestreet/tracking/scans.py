@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float, Float64, Int64
 
 
 @dataclass(frozen=True)
@@ -16,8 +16,9 @@ class Scan:
     """Integer frame; several lidars have several scans of one frame."""
     seconds: float
     """Time, on a clock that all scans share."""
-    points: Float64[np.ndarray, "n 3"]
-    """Returns in the world, meters; z is up. None at all: the frame was not looked at, but has a time."""
+    points: Float[np.ndarray, "n 3"]
+    """Returns in the world, meters; z is up; float32 or float64. None at all: the frame was not looked at, but has a
+    time."""
     origin: Float64[np.ndarray, "3"]
     """Where the lidar stood, in the world."""
 

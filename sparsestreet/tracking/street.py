@@ -83,7 +83,7 @@ def scans_of(log: DrivingLog, held_out: frozenset[int]) -> list[Scan]:
     scans = {frame: Scan(frame, at[frame][0], np.zeros((0, 3)), amid[frame]) for frame in amid}
     for sweep in log.sweeps.where(lambda index: index not in held_out).gray():
         origin = amid[sweep.index] if sweep.origin is None else sweep.origin.double().numpy()
-        scans[sweep.index] = Scan(sweep.index, at[sweep.index][0], sweep.points.double().numpy(), origin)
+        scans[sweep.index] = Scan(sweep.index, at[sweep.index][0], sweep.points.numpy(), origin)
     return [scans[frame] for frame in sorted(scans)]
 
 

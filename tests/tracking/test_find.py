@@ -197,3 +197,28 @@ def test_every_scan_is_reported():
     told = []
     find_objects(drive([], frames=3), SETTINGS, lambda done, total: told.append((done, total)))
     assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def turning_back(seconds: float) -> tuple[float, float, float]:
+    """6 m/s for 1 s, braked at 6 m/s^2, then back at up to 3 m/s; it heads along x all the time."""
+    after = max(seconds - 1.0, 0.0)
+    back = max(after - 1.5, 0.0)
+    return -6 + 6 * min(seconds, 1.0) + 6 * min(after, 1.5) - 3 * min(after, 1.5) ** 2 - 3 * back, 4.0, 0.0
+
+
+def test_a_car_that_reverses_heads_on():
+    thing = Thing(CAR, turning_back)
+    scans = drive([thing], frames=45)
+    (car,) = found(scans)
+    off = np.abs(offsets(car, thing, seconds_of(scans)))
+    assert len(car.frames) >= 40
+    assert off[:, 3].max() < 10  # taken the other way it is 180
+    assert np.median(np.linalg.norm(off[:, :2], axis=1)) < 0.15
+
+
+def test_returns_may_be_float32():
+    scans, (car,) = passed()
+    (other,) = found([replace(scan, points=scan.points.astype(np.float32)) for scan in scans])
+    assert other.frames.tolist() == car.frames.tolist()
+    # Rounding by 1e-6 m lets a return or two change their cells.
+    assert other.world_from_object == pytest.approx(car.world_from_object, abs=0.05)

@@ -1,5 +1,6 @@
 """The parts of the search, beside brute force and beside dense float64 solutions."""
 
+from functools import partial
 from math import factorial
 
 import numpy as np
@@ -7,9 +8,10 @@ import pytest
 
 from sparsestreet.tracking.association import Chain, associate
 from sparsestreet.tracking.clusters import Cluster, cluster_labels, find_clusters
-from sparsestreet.tracking.fit import laid_on_each_other
+from sparsestreet.tracking.fit import fit, laid_on_each_other
 from sparsestreet.tracking.free_space import count_views, seen_through
 from sparsestreet.tracking.ground import find_ground
+from sparsestreet.tracking.joining import join_chains
 from sparsestreet.tracking.objects import FoundObject, upright_poses
 from sparsestreet.tracking.path import BEND, headings, in_frame, smooth, turned
 from sparsestreet.tracking.scans import Returns, Scan, instants
@@ -166,6 +168,49 @@ def test_headings_follow_the_motion_and_are_held_while_it_stands():
     shaken = path[[30] * 20] + np.random.default_rng(0).normal(0, 0.02, (20, 2))
     assert headings(np.vstack((path[:20], shaken)), seconds[:40], 1.0)[0][30:] == pytest.approx(angle[20], abs=0.05)
     assert headings(path[:1], seconds[:1], 1.0)[0].tolist() == [0.0]
+
+
+def test_what_reverses_keeps_its_heading():
+    seconds = np.arange(60) * 0.1
+    speed = np.clip(6 - 4 * np.abs(seconds - 1.0), -2, 6)  # on, and back for longer but slower
+    path = np.cumsum(speed * 0.1)[:, None] * (np.cos(2.5), np.sin(2.5))
+    for places in (path, path[::-1]):
+        yaw, _ = headings(places, seconds, 1.0, reverses=True)
+        # Read backwards in time it is fast the other way.
+        assert np.cos(yaw - 2.5) == pytest.approx(np.full(60, 1.0 if places is path else -1.0), abs=1e-6)
+    assert np.ptp(headings(path, seconds, 1.0)[0]) == pytest.approx(np.pi, abs=1e-6)
+
+
+def test_the_heading_of_what_is_long_is_taken_over_its_length():
+    seconds = np.arange(40) * 0.1
+    corners = np.array([[x, y] for x in np.linspace(-6, 6, 49) for y in np.linspace(-1.25, 1.25, 11)])
+    parts = []
+    for step, time in enumerate(seconds):
+        # Its right side, and for a while its back too: the middle of what is seen jumps by half of its width.
+        whole = 14 <= step < 26
+        seen = corners[(corners[:, 1] < -1.2) | ((corners[:, 0] < -5.9) & whole)]
+        points = np.column_stack((seen + np.array((4 * time, 0)), np.full(len(seen), 1.5)))
+        parts.append(returns_of(points, (-20.0 if whole else 4 * time, -9.0, 1.8)))
+    ground = find_ground([np.zeros((1, 3))])
+    found = fit(Chain(np.arange(40), tuple(parts)), seconds, ground, refine=False)
+    assert found.shape.size[0] == pytest.approx(12.1, abs=0.2)
+    assert np.degrees(np.abs(found.yaw)).max() < 5
+    assert np.abs(found.path[:, 1]).max() < 0.8  # the middle of what is seen jumps by 1.25 m
+
+
+@pytest.mark.parametrize(("behind", "beside", "count"), [(6.6, 0.0, 1), (6.6, 2.5, 2), (8.5, 0.0, 2)])
+def test_pieces_in_line_are_one_and_those_abreast_or_apart_are_two(behind, beside, count):
+    """Boxes of 6 x 2.5 m that keep their places while they drive askew to the axes: a tram between its windows."""
+    yaw, seconds = 2.2, np.arange(30) * 0.1
+    sides = [[x, y, z] for x in np.linspace(-3, 3, 25) for y in (-1.25, 1.25) for z in (0.5, 2.5)]
+    box = np.array([*sides, *([x, y, 1.5] for x in (-3, 3) for y in np.linspace(-1.25, 1.25, 11))])
+    chains = []
+    for shift in np.array(((0, 0, 0), (-behind, beside, 0))):
+        places = [box + shift + np.array((5 * time, 0, 0)) for time in seconds]
+        turns = [np.column_stack((turned(points[:, :2], np.full(len(points), yaw)), points[:, 2])) for points in places]
+        chains.append(Chain(np.arange(30), tuple(returns_of(points, (0.0, -9.0, 1.8)) for points in turns)))
+    fitted = partial(fit, seconds=seconds, ground=find_ground([np.zeros((1, 3))]), refine=False)
+    assert len(join_chains(chains, fitted, seconds, TrackingSettings())) == count
 
 
 def test_the_road_is_found_below_walls_cars_and_reflections():

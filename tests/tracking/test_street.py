@@ -103,7 +103,7 @@ def test_found_boxes_carry_returns_as_annotated_ones_do():
     tracks = tracks_of(plain, [found_of(annotated.tracks[0])], CLASSES)
     own = plain.with_tracks(tracks)
     assert not torch.equal(there(plain.frames[0].depth), there(own.frames[0].depth))
-    assert (own.is_annotated, plain.is_annotated) == (True, False)
+    assert (annotated.is_annotated, plain.is_annotated, own.is_annotated) == (True, False, False)
     split, own_split = (StreetData(log, stride=4, offset=2).driving_log for log in (annotated, own))
     for wanted, got in ((annotated, own), (split, own_split)):
         for one, other in zip(wanted.frames, got.frames, strict=True):
@@ -158,3 +158,24 @@ def test_found_objects_join_annotated_ones_without_doubling():
         box("meeting", [-30.0, -20.0, 2.0, 3.0, 34.0, 45.0]): True,  # two of six
     }.items():
         assert joined([known], [other]) == ((known,) if same else (known, other)), other.name
+
+
+def test_crooked_annotations_are_not_doubled():
+    """Boxes that are off, of every fifth sweep, between its instants, or of a part of the way."""
+    path, times = np.arange(21.0) * 1.5, np.linspace(0.0, 1.0, 21)
+    found = replace(box("found", path.tolist()), times=torch.from_numpy(times), found=True)
+    slow = replace(box("slow", path[::5].tolist(), y=0.5), frames=torch.arange(0, 21, 5))
+    for annotated in (
+        replace(slow, times=torch.from_numpy(times[::5])),
+        # Annotated 40 ms late, where the car is by then: 0.6 m ahead.
+        replace(
+            box("late", (path[:20:5] + 0.6).tolist()),
+            frames=torch.arange(0, 20, 5),
+            times=torch.from_numpy(times[:20:5] + 0.4 / 20),
+        ),
+        replace(box("ends", path[:4].tolist(), y=-0.5), times=torch.from_numpy(times[:4])),
+    ):
+        assert joined([annotated], [found]) == (annotated,), annotated.name
+    after = replace(found, frames=found.frames + 4, times=found.times)
+    short = replace(box("short", path[:4].tolist()), times=torch.from_numpy(times[:4]))
+    assert joined([short], [after]) == (short, after)  # where one ends, the other goes on

@@ -12,6 +12,7 @@ from sparsestreet.cli.commands.scenes import open_scene
 from sparsestreet.cli.config.targets import made, open_run_config
 from sparsestreet.cli.config.validate import device_of, type_problem
 from sparsestreet.cli.runs.run import data_of, this_command
+from sparsestreet.cli.runs.tracks import check_objects, finds
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.naming import printable
 from sparsestreet.records.run import RUN, RunDescription, this_machine
@@ -79,10 +80,13 @@ def measure(options: Options) -> None:
     torch.set_num_threads(min(description.threads, this_machine().cores))
     extra = options.extra(made(cfg.evaluation))
     stored = open_scene(run, "cpu", options.parts)
+    data = data_of(cfg, run)
+    if finds(cfg, data.driving_log):
+        check_objects(stored.scene, data.driving_log)
     summary = evaluate_run(
         stored.scene,
         stored.options,
-        data_of(cfg),
+        data,
         run,
         device=_device(description, options.device),
         command=this_command(["evaluate", f"run={run}", *extra_words(extra)]),

@@ -56,7 +56,7 @@ def _lines(cfg: "DictConfig", to: Path | None) -> "Iterator[str]":
     from dataclasses import replace
 
     from sparsestreet.cli.config.targets import made
-    from sparsestreet.cli.runs.run import found_classes, joins
+    from sparsestreet.cli.runs.tracks import found_classes, joins
     from sparsestreet.kept import Kept
     from sparsestreet.pictures.from_above import kinds_in_words
     from sparsestreet.tracking.street import assumptions, check_lidar, found_objects, joined, tracks_of
@@ -168,15 +168,15 @@ def _returns(
 
 
 def _tile(log: "DrivingLog", each: "FoundObject", track: "Track") -> "Tile | None":
-    """The object in the image that shows it best; None where none shows its middle."""
+    """The object in the image that shows it best: large and, having many returns, not hidden. None where none does."""
     from sparsestreet.pictures.from_above import box_in_image
     from sparsestreet.pictures.sheets import Tile
 
     best, shown = None, 0.0
     returns = dict(zip(each.frames.tolist(), each.returns.tolist(), strict=True))
     for place, view in enumerate(log.views):
-        if returns.get(view.indices[0], 0) and (corners := _corners_in(view, track)) is not None:
-            score = _shown(corners, (view.camera.width, view.camera.height))
+        if (count := returns.get(view.indices[0], 0)) and (corners := _corners_in(view, track)) is not None:
+            score = count * _shown(corners, (view.camera.width, view.camera.height))
             best, shown = ((place, corners), score) if score > shown else (best, shown)
     if best is None:
         return None

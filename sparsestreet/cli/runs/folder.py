@@ -131,6 +131,8 @@ def has_checkpoint(run: Path) -> bool:
 log = logging.getLogger(__name__)
 
 CONFIGURATION = ".hydra"
+TRACKS_FILE = f"{CONFIGURATION}/tracks.json"
+"""Objects that a run has found, beside what it was asked: who opens it sees these, not what a newer version finds."""
 OF_A_RUN = (
     "scene.safetensors",
     "views.json",
@@ -273,6 +275,7 @@ def take_folder(cfg: DictConfig, out: Path, goes_on: bool) -> None:
         for name in OF_A_RUN:
             path = out / name
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+        (out / TRACKS_FILE).unlink(missing_ok=True)
     folder = out / CONFIGURATION
     folder.mkdir(parents=True, exist_ok=True)
     config = _without_environment(cfg)

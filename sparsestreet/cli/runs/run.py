@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
@@ -18,18 +18,15 @@ from sparsestreet.cli.config.compose import check_moved, configuration, resolved
 from sparsestreet.cli.config.log_from_options import reader_of
 from sparsestreet.cli.config.validate import config_problem, preset_notes
 from sparsestreet.cli.process import is_worker_rank, keep_freed_memory
-from sparsestreet.cli.runs.folder import lies_in, moments_to_keep, start_from_trunk, start_of, take_folder
+from sparsestreet.cli.runs.folder import lies_in, moments_to_keep, run_of, start_from_trunk, start_of, take_folder
 from sparsestreet.cli.runs.locks import devices_of_job
+from sparsestreet.cli.runs.tracks import finds, with_tracks, write_tracks
 from sparsestreet.data.datamodule import StreetData
-from sparsestreet.data.log import DrivingLog, split
 from sparsestreet.evaluation.speed import forget_peaks
 from sparsestreet.kept import Kept
 from sparsestreet.phases import StageRecorder, stage
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.scene.rendering import RenderOptions
-from sparsestreet.tracking.objects import Kind
-from sparsestreet.tracking.settings import TrackingSettings
-from sparsestreet.tracking.street import found_tracks, joined
 from sparsestreet.training.callbacks import PhaseTimes
 from sparsestreet.training.recipe import Recipe, RunIdentity
 from sparsestreet.training.run import build, fit, train
@@ -64,58 +61,21 @@ def _render_options(cfg: DictConfig) -> RenderOptions:
     return instantiate({key: value for key, value in said.items() if key != "preset"}, _convert_="all")
 
 
-def data_of(cfg: DictConfig) -> StreetData:
-    """The log, and its split into views to train on and views held out. Raises ValueError for a key that has moved."""
+def data_of(cfg: DictConfig, run: Path | None = None) -> StreetData:
+    """The log, and its split into views to train on and views held out.
+
+    ``run``: one that has begun, and knows what it has found (``tracks.with_tracks``).
+
+    Raises ValueError for a key that has moved.
+    """
     check_moved(cfg)
     reader = reader_of(cfg)
     log = reader.read()
     if (identity := reader.identity()) is not None:
         log = replace(log, kept=Kept(cfg.get("cache"), identity))
-    log = _with_tracks(cfg, log)
+    log = with_tracks(cfg, log, run)
     # A matter of the log, though it is listed with the effects: its frames are masked before anything sees them.
     return StreetData(log, **cfg.split, seed=cfg.seed, hood=_masked_from(cfg, "hood"), dirt=_masked_from(cfg, "dirt"))
-
-
-def _with_tracks(cfg: DictConfig, log: DrivingLog) -> DrivingLog:
-    """The log with the objects that the configuration asks for (conf/tracks).
-
-    Raises ValueError where they are to be found, and there is no lidar, or a kind of them has no class.
-    """
-    asked = cfg.get("tracks") or {"name": "log"}  # runs of earlier versions do not say
-    name = asked["name"]
-    if name == "log" and not log.is_annotated and len(log.sweeps) and _has_objects(cfg):
-        said = "%s has no boxes: objects are found in its lidar (tracks=found; tracks=none goes without)"
-        logging.getLogger(__name__).info(said, log.name)
-        name = "found"
-    if name == "log":
-        return log
-    if name == "none":
-        return log.with_tracks(())
-    settings = instantiate(asked["settings"]) if "settings" in asked else TrackingSettings()
-    parts = split(log, stride=cfg.split.stride, offset=cfg.split.offset, cameras=cfg.split.cameras)
-    found = found_tracks(log, settings, parts.held_out_indices, found_classes(cfg))
-    return log.with_tracks(joined(log.tracks, found) if joins(cfg) else found)
-
-
-def joins(cfg: DictConfig) -> bool:
-    """Whether found objects join the log's own. Raises ValueError for what is neither true nor false."""
-    join = (cfg.get("tracks") or {}).get("join", False)
-    if not isinstance(join, bool):
-        raise ValueError(f"tracks.join is true or false, got {join!r}")
-    return join
-
-
-def _has_objects(cfg: DictConfig) -> bool:
-    """Whether some node takes objects of a class."""
-    return any(node.get("classes") for node in cfg.node.values())
-
-
-def found_classes(cfg: DictConfig) -> dict[str, str]:
-    """Kind of a found object -> the first class of the log that data.classes has for it. Raises ValueError for none."""
-    for kind in (kinds := get_args(Kind)):
-        if not cfg.data.classes.get(kind):
-            raise ValueError(f"a found {kind} needs a class: name one, data.classes.{kind}=[{kind}]")
-    return {kind: cfg.data.classes[kind][0] for kind in kinds}
 
 
 def _masked_from(cfg: DictConfig, name: str) -> float | None:
@@ -183,16 +143,19 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
     recipe_of(cfg)  # what does not fit together is said before a log is read
     extra, logger = instantiate(cfg.evaluation, _convert_="all"), instantiate(cfg.logger) if cfg.logger else False
     stages = StageRecorder(started)
+    with stages, stage("start"):
+        start = start_of(cfg, out) or start_from_trunk(cfg, out)
     with stages, stage("data"):
-        data = data_of(cfg)
+        data = data_of(cfg, None if start is None else run_of(start))
     with stages, stage("start"):
         known = with_images(cfg, len(data.split.train))
         # The job's own overrides: in a sweep they are not what was typed.
         identity = identity_of(known, this_command(["train", *HydraConfig.get().overrides.task]))
         recipe = recipe_of(known)
-        start = start_of(cfg, out) or start_from_trunk(cfg, out)
         if not is_worker_rank(cfg.trainer):
             take_folder(cfg, out, goes_on=start is not None and lies_in(start, out))
+            if finds(known, data.driving_log):
+                write_tracks(out, data.driving_log.tracks)
     with devices_of_job(cfg.trainer) as devices:
         summary = train(
             recipe,

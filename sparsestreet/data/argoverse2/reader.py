@@ -308,6 +308,16 @@ def _mount(layout: Layout, names: np.ndarray, poses: Float64[Tensor, "n 4 4"], n
     return poses[int(rows[0])]
 
 
+def read_lidar(layout: Layout) -> Float64[Tensor, "3"] | None:
+    """Where the upper lidar stands in the vehicle's frame; None where the calibration has none; raises LogError.
+
+    The lower one stands 0.1 m below it.
+    """
+    mounts = read_columns(layout.mounts, {"sensor_name": str} | dict.fromkeys(TRANSLATION, float))
+    rows = np.flatnonzero(mounts["sensor_name"] == "up_lidar")
+    return _rows(mounts, TRANSLATION)[int(rows[0])] if len(rows) else None
+
+
 def read_boxes(
     layout: Layout, sweeps: Sequence[int], frames: Mapping[int, int], path: PosePath
 ) -> tuple[list[Boxes], int]:
@@ -477,9 +487,12 @@ def _shots(chosen: Selection, mounts: Mapping[str, MountedCamera], path: PosePat
 
 
 def _sweeps(chosen: Selection, path: PosePath) -> dict[int, LidarSweep]:
-    poses = path.at(torch.tensor(chosen.instants))
+    poses, place = path.at(torch.tensor(chosen.instants)), read_lidar(chosen.layout)
+    stood = None if place is None else poses[:, :3, :3] @ place + poses[:, :3, 3]
     return {
-        frame: LidarSweep(partial(read_sweep, chosen.sweeps[stamp], poses[frame]), stamp)
+        frame: LidarSweep(
+            partial(read_sweep, chosen.sweeps[stamp], poses[frame]), stamp, None if stood is None else stood[frame]
+        )
         for frame, stamp in enumerate(chosen.instants)
     }
 

@@ -21,13 +21,17 @@ from sparsestreet.data.synthetic.capture import Instant, StreetCamera, captured
 from sparsestreet.data.synthetic.render import developed
 from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.street import HUMAN_CLASSES, VEHICLE_CLASSES, make_street, street_name, with_declared
-from sparsestreet.data.synthetic.world import build_world
+from sparsestreet.data.synthetic.world import World, build_world
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.types import Camera, Frame, View
 
 
-def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"]) -> Truth:
+def street_truth(
+    settings: StreetSettings, street_from_world: Float64[Tensor, "4 4"], world: World | None = None
+) -> Truth:
     """Return a function: a camera and a time in the log's world -> what the street's camera would record there.
+
+    ``world`` is the street with other things in it than the settings say; None: as they say.
 
     What belongs to a recorded image alone is left out: its exposure, white balance, blur, hood and compression. It is
     what the view's own pose sees, so at a recorded view whose pose is noisy it is not the recorded image.
@@ -36,7 +40,7 @@ def street_truth(settings: StreetSettings, street_from_world: Float64[Tensor, "4
     ``annotation_range`` from the camera, annotated or not. A view's lens is applied, and its shutter's motion if that
     has its ``seconds``.
     """
-    world, (first, last) = build_world(settings), settings.recorded
+    world, (first, last) = build_world(settings) if world is None else world, settings.recorded
     instant_at = lru_cache(maxsize=64)(lambda seconds: Instant.at(world, seconds))
 
     def truth(view: View) -> Frame | None:

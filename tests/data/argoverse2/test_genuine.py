@@ -13,6 +13,7 @@ from sparsestreet.data.argoverse2.reader import (
     find_log,
     read_boxes,
     read_cameras,
+    read_lidar,
     read_path,
     read_sweep,
     stamped_files,
@@ -90,6 +91,9 @@ def test_its_cameras_are_pinholes_and_one_stands_upright(layout):
     # Looks ahead, and its image's y goes down.
     assert front.ego_from_camera[0, 2] > 0.99
     assert front.ego_from_camera[2, 1] < -0.99
+    stood = there(read_lidar(layout))
+    assert float((stood - front.ego_from_camera[:3, 3]).norm()) < 0.5
+    assert stood.tolist() == pytest.approx([1.35018, 0.0, 1.64042], abs=1e-5)
 
 
 def test_a_log_whose_images_were_not_fetched_is_refused_in_words(genuine):

@@ -64,6 +64,8 @@ def test_returns_lie_where_they_were(kind, atol, tmp_path):
         expected = PLAN.world_points(frame)[np.argsort(stamps, kind="stable")]
         np.testing.assert_allclose(sweep.read().numpy(), expected, atol=atol)
         assert sweep.stamp == sweep_stamp(PLAN, frame)
+        stood = PLAN.world_from_vehicle(there(sweep.stamp)) @ PLAN.vehicle_from_lidar
+        np.testing.assert_allclose(there(sweep.origin).numpy(), stood[:3, 3], atol=1e-6)
 
 
 def test_boxes_stand_at_the_stamps_of_their_sweeps(log):

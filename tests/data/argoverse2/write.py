@@ -88,7 +88,8 @@ def _write_calibration(log: Path, plan: Plan) -> None:
     write_table(log / "calibration/intrinsics.feather", {"sensor_name": list(cameras)} | numbers | lens | sizes)
     mounts = [camera.vehicle_from_camera for camera in cameras.values()]
     names = [*cameras, "up_lidar", "down_lidar"]
-    poses = transforms(np.stack([*mounts, plan.vehicle_from_lidar, plan.vehicle_from_lidar]))
+    lower = plan.vehicle_from_lidar - np.outer([0, 0, 0.2, 0], [0, 0, 0, 1])
+    poses = transforms(np.stack([*mounts, plan.vehicle_from_lidar, lower]))
     write_table(log / "calibration/egovehicle_SE3_sensor.feather", {"sensor_name": names} | poses)
 
 
