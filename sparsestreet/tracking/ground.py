@@ -72,8 +72,8 @@ def _plane(heights: Float64[np.ndarray, "x y"]) -> Float64[np.ndarray, "x y"]:
         root = np.sqrt(weights)
         found = np.asarray(np.linalg.lstsq(table * root[:, None], values * root, rcond=None)[0])
         error = values - table @ found
-        # What stands lies above the road, and little lies below: errors above count less, and less the larger.
-        weights = 1 / (1 + (error / np.where(error > 0, 0.2, 1.0)) ** 2)
+        # What stands lies far from the road: errors count less the larger they are.
+        weights = 1 / (1 + (error / 0.2) ** 2)
     return found[0] + found[1] * grid[0] + found[2] * grid[1]
 
 

@@ -200,6 +200,7 @@ def test_the_command_of_a_log_in_which_nothing_moves(bare, finder, tmp_path, cap
         ([], "say sparsestreet data tracks DIR"),
         (["{log}", "{log}"], "name one folder"),
         (["{log}", "to="], "to=DIR names one folder"),
+        (["{log}", "out=boxes"], "out= is of trainings: say to=boxes"),
         (["{log}", "tracks=none"], "tracks=none does not: leave it out"),
         (["{log}", "tracks.settings.min_moved=far"], "tracks.settings.min_moved must be float"),
         (["{log}", "data.log.lidar=false"], "tracks are found in lidar"),

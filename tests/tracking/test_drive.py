@@ -127,6 +127,22 @@ def test_an_object_is_followed_by_returns_that_are_not_always_there(leaves):
     assert chain.steps.tolist() == ([3, 4, 5] if leaves else [])
 
 
+def test_an_object_that_turns_is_followed_around_the_corner():
+    """Straight ahead for half a second, and then around a circle of 12 m; its box turns with it."""
+    corners = np.array([[x, y, 1.0] for x in np.linspace(-2.2, 2.2, 12) for y in np.linspace(-0.95, 0.95, 5)])
+    drive, path = [], []
+    for step in range(34):
+        yaw = 0.8 * max(step - 4, 0) / 12
+        path.append(np.array((0.8 * min(step, 4) + 12 * np.sin(yaw), 12 - 12 * np.cos(yaw))))
+        turn = np.array([[np.cos(yaw), np.sin(yaw), 0], [-np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+        points = corners @ turn + np.append(path[-1], 0)
+        flags = [np.ones(len(points), bool), np.ones(len(points), bool), np.zeros(len(points), bool)]
+        drive.append(Instant(Returns(points, np.tile((5.0, -30.0, 1.8), (len(points), 1))), *flags))
+    chain = extended(driving(np.array(path[:5]), (4.5, 2.0, 1.5)), drive, 0.1 * np.arange(34), SETTINGS)
+    assert chain.steps.tolist() == list(range(5, 34))
+    assert min(map(len, chain.parts)) > len(corners) / 2
+
+
 def test_an_object_goes_somewhere():
     seconds = 0.1 * np.arange(9)
     along = np.column_stack((np.arange(9.0), np.zeros(9)))

@@ -224,8 +224,11 @@ def test_the_road_is_found_below_walls_cars_and_reflections():
         height[plan[:, 1] > 9] += 8  # a row of houses
         scans.append(np.column_stack((plan, height)))
     scans[0][:40, 2] -= 3  # as in a wet road
+    puddle = (np.abs(scans[1][:, :2] + 8) < 2).all(1)
+    scans[1][puddle, 2] -= 2
     places = random.uniform((-14, -14), (14, 8), (500, 2))
     places[:40] = random.uniform((2.5, 3.4), (5.5, 4.6), (40, 2))
+    places[40:60] = random.uniform(-9, -7, (20, 2))
     # Cells are half a meter across, and lows lie up to two deviations deep.
     assert find_ground(scans).below(places) == pytest.approx(0.12 * places[:, 0] - 0.05 * places[:, 1], abs=0.2)
     assert find_ground([np.zeros((0, 3))]).below(places).tolist() == [0.0] * 500
@@ -383,3 +386,34 @@ def test_a_chain_takes_what_is_as_large_and_may_grow_smaller_step_by_step():
     # By a factor 0.8 each time, 0.2 in all, as of a car whose back alone is seen at last: exp(-1.2) is 0.3.
     slow = [[cluster_at(0.5 * step, 5 * 0.8**step)] for step in range(8)]
     assert [len(chain) for chain in associate(slow, seconds, SETTINGS)] == [8]
+
+
+def test_what_is_seen_now_from_one_end_and_now_from_the_other_is_one():
+    """The middles of what is seen jump; the velocity is that of many, and so is the place."""
+    seconds, number = 0.1 * np.arange(20), np.arange(20)
+    hidden = [[cluster_at(x, 4.0)] for x in 0.5 * number + 0.3 * (-1.0) ** number]
+    hidden[10:16] = [[]] * 6
+    assert [len(chain) for chain in associate(hidden, seconds, SETTINGS)] == [14]
+    late = [[cluster_at(x, 4.0)] for x in 0.5 * number + np.where(number < 8, 0.02, 0.55) * (-1.0) ** number]
+    assert [len(chain) for chain in associate(late, seconds, SETTINGS)] == [20]
+
+
+def test_sizes_decide_where_places_hardly_do():
+    seconds = 0.1 * np.arange(5)
+    frames = [[cluster_at(0.0, 4.0), cluster_at(1.0, 2.0)] for _ in seconds]
+    frames[4] = [cluster_at(0.45, 2.0), cluster_at(0.55, 4.0)]  # nearer to each other's places than to their own
+    large, small = associate(frames, seconds, SETTINGS)
+    assert np.ptp(large.parts[-1].points[:, 0]) > np.ptp(small.parts[-1].points[:, 0])
+
+
+def test_what_brakes_while_it_is_hidden_is_expected_at_its_mean_velocity():
+    seconds = 0.1 * np.arange(38)
+    steps = (np.arange(10), np.arange(28, 38))
+    places = (15 * seconds[steps[0]], 15 * 0.9 + 13 * 1.9 + 11 * (seconds[steps[1]] - 2.8))
+    side = np.array([[x, y, 1.0] for x in np.linspace(-2, 2, 9) for y in (-0.9, 0.9)])
+    chains = [
+        Chain(own, tuple(returns_of(side + np.array((x, 0, 0)), (10.0, -20.0, 1.8)) for x in xs))
+        for own, xs in zip(steps, places, strict=True)
+    ]
+    fitted = partial(fit, seconds=seconds, ground=find_ground([np.zeros((1, 3))]), refine=False)
+    assert len(join_chains(chains, fitted, seconds, TrackingSettings())) == 1

@@ -36,6 +36,8 @@ def tracks(arguments: Sequence[str]) -> int:
     folders = [text for text in arguments if "=" not in text and not text.startswith("-")]
     if len(given) > 1 or "" in given:
         raise UsageError(f"to=DIR names one folder, got {' '.join(arguments)}")
+    if written := [text for text in arguments if text.startswith("out=")]:
+        raise UsageError(f"out= is of trainings: say to={written[0].partition('=')[2]} for the folder of the boxes")
     if len(folders) > 1:
         raise UsageError(f"{ONE_LOG}, got {' '.join(folders)}")
     words = [text for text in arguments if text not in folders and not text.startswith("to=")]
@@ -71,7 +73,8 @@ def _lines(cfg: "DictConfig", to: Path | None) -> "Iterator[str]":
     objects = found_objects(log, made(cfg.tracks.settings))
     if log.kept.found:
         yield str(log.kept)
-    yield f"{log.name}: {kinds_in_words(Counter(each.kind for each in objects))} found in {len(log.sweeps)} sweeps"
+    sweeps = "one sweep, where nothing can be seen to move" if len(log.sweeps) == 1 else f"{len(log.sweeps)} sweeps"
+    yield f"{log.name}: {kinds_in_words(Counter(each.kind for each in objects))} found in {sweeps}"
     yield from table(log, objects)
     found = tracks_of(log, objects, found_classes(cfg))
     out = Path("outputs/tracks") / log.name if to is None else to
