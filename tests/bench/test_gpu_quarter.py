@@ -219,6 +219,7 @@ def test_other_words_are_refused():
     assert (said.returncode, said.stderr.startswith("usage: scripts/gpu_quarter.sh first|second")) == (2, True)
 
 
+@pytest.mark.lengthy
 @pytest.mark.interpreted
 def test_a_rendering_that_does_not_wait_writes_the_same_bits(tmp_path, monkeypatch):
     """On a device it is what a graph captures."""
