@@ -383,7 +383,8 @@ def project_rows(
     bad = tl.sum((wrong | (good == 0)).to(tl.int32))
     place = tl.arange(0, 4)
     number = tl.where(place == 0, pairs, tl.where(place == 1, drawn, bad))
-    to = numbers + place * blocks + block
-    # The launch before this one has counted the rows of the block that are not its own.
-    shared = (place < 3) & (block * BLOCK < start)
-    tl.store(to, number.to(tl.int64) + tl.load(to, shared, 0), place < 3)
+    number, to = number.to(tl.int64), numbers + place * blocks + block
+    if STORED >= 0:
+        # The launch before this one has counted the rows of the block that are not its own.
+        number += tl.load(to, (place < 3) & (block * BLOCK < start), 0)
+    tl.store(to, number, place < 3)

@@ -56,8 +56,11 @@ def load_columns(table, row, mask, COUNT: tl.constexpr):
 def places_of(first, rest, row, COLUMN: tl.constexpr, STORED: tl.constexpr):
     """Where 16 numbers of each row's harmonics lie, from COLUMN on; STORED: the coefficients behind the first."""
     column = (COLUMN + tl.arange(0, 16))[None, :]
-    behind = rest + row[:, None] * (3 * STORED) + (column - 3)
-    return tl.where(column < 3, first + row[:, None] * 3 + column, behind), column
+    place = rest + row[:, None] * (3 * STORED) + (column - 3)
+    # Elsewhere a choice of addresses would only take registers.
+    if COLUMN == 0:
+        place = tl.where(column < 3, first + row[:, None] * 3 + column, place)
+    return place, column
 
 
 @jit
