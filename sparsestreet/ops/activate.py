@@ -30,7 +30,8 @@ def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "a
         from sparsestreet.ops.triton.activate import activate as activated
     else:
         activated = _activate
-    return Gaussians(*activated(parts), harmonics_of(parts, sh_degree))
+    sh = harmonics_of(parts, sh_degree)
+    return Gaussians.of_learned((*activated(parts), *sh.tables), sh.terms)
 
 
 def _activate(parts: Sequence[RawGaussians]) -> Sequence[Tensor]:

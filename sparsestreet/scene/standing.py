@@ -106,7 +106,8 @@ class _KeptRows:
                 self._make(still, count, sh_degree)
             if others:
                 self._write(activate(others, sh_degree=sh_degree), self._head)
-        return Gaussians(*(column[:count] for column in self._columns), harmonics_of(parts, sh_degree))
+        sh = harmonics_of(parts, sh_degree)
+        return Gaussians.of_learned((*(column[:count] for column in self._columns), *sh.tables), sh.terms)
 
     def _fits(self, still: Sequence[RawGaussians], count: int) -> bool:
         stored = [tensor for part in still for tensor in _stored(part)]

@@ -214,8 +214,9 @@ def test_every_instruction_set(variant, dtype):
     if load_library().splat_variant_name(variant) is None:
         pytest.skip(f"this processor does not run variant {variant}")
     parts = case(15, masked=True, placed=True, count=37, dtype=dtype)
+    sh = harmonics_of(parts, 3)
     found = values_and_gradients(
-        parts, lambda parts: Gaussians(*fused.activate(parts, variant), harmonics_of(parts, 3))
+        parts, lambda parts: Gaussians.of_learned((*fused.activate(parts, variant), *sh.tables), sh.terms)
     )
     expected = values_and_gradients(parts, lambda parts: activate(parts, sh_degree=3, backend="torch"))
     for value, truth in zip(found, expected, strict=True):

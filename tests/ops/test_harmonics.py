@@ -8,6 +8,7 @@ from torch import Tensor
 
 from sparsestreet.ops import SplatSettings, contribution, leave_one_out, splat
 from sparsestreet.ops.activate import activate
+from sparsestreet.ops.raster import empty_gradients
 from sparsestreet.ops.raw import Placement, Poses, RawGaussians
 from sparsestreet.types import Camera, Gaussians, Harmonics, Shutter
 from tests.conftest import unchecked
@@ -65,7 +66,7 @@ def street(dtype: torch.dtype, device: torch.device = CPU, seed: int = 0) -> Gau
         rest.append(drawn.dense_sh()[begin:end, 1 : 1 + stored])
     fields = [value.to(device, dtype, copy=True).requires_grad_() for value in drawn.learned()[:4]]
     tables = [[value.to(device, dtype, copy=True).requires_grad_() for value in some] for some in (first, rest)]
-    return Gaussians(*fields, Harmonics(tuple(tables[0]), tuple(tables[1]), 16))
+    return Gaussians.of_learned([*fields, *tables[0], *tables[1]], 16)
 
 
 def tables_of(rows: Gaussians) -> Harmonics:
@@ -106,6 +107,13 @@ def test_tables_are_drawn_as_one_table_of_the_same_numbers(monkeypatch, backend,
     used = [there(rest)[:, : case.terms - 1].abs().sum() > 0 for rest in rests if rest is not None and len(rest)]
     assert all(used)
     assert not any(there(rest)[:, case.terms - 1 :].any() for rest in rests if rest is not None)
+
+
+def test_gradients_that_nobody_asks_for_take_no_memory():
+    fields = street(torch.float32).learned()
+    for terms, place, some in ((16, 10, True), (16, 11, False), (1, 10, False)):
+        asked = [one != 11 for one in range(len(fields))]
+        assert (empty_gradients(fields, terms, asked)[place] is not None) == some
 
 
 @every_backend
@@ -161,9 +169,7 @@ def test_the_same_bits_for_any_number_of_threads():
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 def test_activation_leaves_harmonics_where_nodes_keep_them(backend):
     shapes = ((3,), (3,), (4,), (), (1, 3))
-    parts = [
-        RawGaussians(*(torch.ones(4, *shape) for shape in shapes), torch.ones(4, stored, 3)) for stored in (3, 15, 0)
-    ]
+    parts = [RawGaussians(*(torch.ones(4, *shape) for shape in (*shapes, (stored, 3)))) for stored in (3, 15, 0)]
     present = Poses(torch.eye(4)[:2], torch.zeros(2, 3), torch.tensor([True, False]))
     parts[1] = replace(parts[1], placement=Placement(present, torch.tensor([0, 1, 0, 1])))
     found = activate(parts, sh_degree=2, backend=backend)
