@@ -342,7 +342,9 @@ def project_rows_backward(
 
     SUMS: how many numbers a row has in ``sums``, of which the first twelve are read. REST: whether coefficients behind
     the first have gradients."""
-    row = start + tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    if STORED >= 0:
+        row += start
     given = row < end
     seen = given & (tl.load(tile_counts + row, given, 0) > 0)
     rotation = load_matrix(view + ROTATION)

@@ -196,8 +196,9 @@ def test_effects_that_are_off_are_not_in_the_row_kernels(compiled, name):
 
 # Loads, stores and registers of a lane's row: 16 warps of a multiprocessor then run at once.
 ROW_BUDGETS = {"project_rows": (54, 7, 128), "project_rows_backward": (50, 22, 128)}
-# Rows of 45 numbers do not begin at multiples of 16 bytes: each number is loaded and stored alone.
-TABLE_BUDGETS = {"project_rows": (91, 7, 128), "project_rows_backward": (86, 58, 184)}
+# Rows of 45 numbers do not begin at multiples of 16 bytes: each number is loaded and stored alone, and addresses take
+# registers: in backward 8 warps run at once.
+TABLE_BUDGETS = {"project_rows": (91, 7, 128), "project_rows_backward": (86, 58, 192)}
 
 
 @pytest.mark.slow
