@@ -169,7 +169,10 @@ def test_the_same_bits_for_any_number_of_threads():
 @pytest.mark.parametrize("backend", ["torch", "cpu"])
 def test_activation_leaves_harmonics_where_nodes_keep_them(backend):
     shapes = ((3,), (3,), (4,), (), (1, 3))
-    parts = [RawGaussians(*(torch.ones(4, *shape) for shape in (*shapes, (stored, 3)))) for stored in (3, 15, 0)]
+    means, scales, turns, logits, first = (torch.ones(4, *shape) for shape in shapes)
+    parts = [
+        RawGaussians(means, scales, turns, logits, first.clone(), torch.ones(4, stored, 3)) for stored in (3, 15, 0)
+    ]
     present = Poses(torch.eye(4)[:2], torch.zeros(2, 3), torch.tensor([True, False]))
     parts[1] = replace(parts[1], placement=Placement(present, torch.tensor([0, 1, 0, 1])))
     found = activate(parts, sh_degree=2, backend=backend)
