@@ -158,7 +158,7 @@ class TrainingStep:
 
     def __init__(self, start: Gaussians, camera: Camera, render: Render) -> None:
         g = start
-        fields = (g.means, g.quaternions, g.scales.log(), g.opacities.clamp(1e-6, 1 - 1e-6).logit(), g.sh)
+        fields = (g.means, g.quaternions, g.scales.log(), g.opacities.clamp(1e-6, 1 - 1e-6).logit(), g.dense_sh())
         self.parameters = [field.detach().clone().requires_grad_() for field in fields]
         self.optimizer = torch.optim.Adam(self.parameters, lr=1e-6, eps=1e-15, fused=g.means.is_cuda)
         generator = torch.Generator().manual_seed(2)

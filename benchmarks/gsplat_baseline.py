@@ -77,13 +77,13 @@ def _rasterization(
     module: ModuleType, gaussians: Gaussians, camera: Camera, packed: bool
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Calls gsplat with ``absgrad``, because our op sums absolute screen gradients by default."""
-    degree, settings = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians.sh.shape[1]], settings_beside(module)
+    degree, settings = {1: 0, 4: 1, 9: 2, 16: 3}[gaussians.dense_sh().shape[1]], settings_beside(module)
     return module.rasterization(
         means=gaussians.means,
         quats=gaussians.quaternions,
         scales=gaussians.scales,
         opacities=gaussians.opacities,
-        colors=gaussians.sh,
+        colors=gaussians.dense_sh(),
         viewmats=camera.camera_from_world.to(gaussians.means)[None],
         Ks=camera.intrinsics.to(gaussians.means)[None],
         width=camera.width,

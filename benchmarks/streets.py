@@ -65,7 +65,7 @@ def refined(street: BenchScene, factor: int, seed: int = 0) -> BenchScene:
         quaternions,
         scales / factor,
         repeated(gaussians.opacities),
-        repeated(gaussians.sh),
+        repeated(gaussians.dense_sh()),
         None if gaussians.displacements is None else repeated(gaussians.displacements),
     )
     source = f"{street.source}, refined {factor}x{factor}"

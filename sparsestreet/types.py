@@ -10,6 +10,7 @@ Conventions, everywhere:
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Literal
 
@@ -35,6 +36,52 @@ def _check_times(time: float, seconds: float | None) -> None:
 
 
 @dataclass(frozen=True)
+class Harmonics:
+    """Spherical harmonics as scene nodes keep them: tables whose rows follow each other, the first coefficient apart.
+
+    >>> first, rest = torch.zeros(2, 1, 3), torch.ones(2, 3, 3)
+    >>> Harmonics((first, first), (rest[:, :0], rest), terms=4).dense()[:, 1, 0]  # what is not stored is 0
+    tensor([0., 0., 1., 1.])
+    """
+
+    first: tuple[Float[Tensor, "_ 1 3"], ...]
+    rest: tuple[Float[Tensor, "_ _ 3"], ...]
+    """What stands behind the first coefficients, 0, 3, 8 or 15 a row."""
+    terms: int
+    """Coefficients in use, 1, 4, 9 or 16; a table that stores fewer uses all of its own."""
+
+    @property
+    def tables(self) -> tuple[Tensor, ...]:
+        """All tables, the first coefficients before the rest."""
+        return *self.first, *self.rest
+
+    def used(self, place: int) -> int:
+        """Number of coefficients in use of a table's rows."""
+        return min(self.terms, 1 + self.rest[place].shape[1])
+
+    def dense(self) -> Float[Tensor, "n k 3"]:
+        """All rows in one table, padded with zeros."""
+        tables = []
+        for place, (first, rest) in enumerate(zip(self.first, self.rest, strict=True)):
+            used = self.used(place)
+            tables.append(torch.cat((first, rest[:, : used - 1]), dim=1) if used > 1 else first)
+        return _joined(tables)
+
+
+def _joined(tables: Sequence[Float[Tensor, "_ _ 3"]]) -> Float[Tensor, "n k 3"]:
+    """The rows of all tables; those with fewer coefficients are padded with zeros."""
+    if len(tables) == 1:
+        return tables[0]
+    terms = max(table.shape[1] for table in tables)
+    # pad copies even when it adds nothing, and the harmonics are most of a scene's memory traffic.
+    padded = [
+        table if table.shape[1] == terms else torch.nn.functional.pad(table, (0, 0, 0, terms - table.shape[1]))
+        for table in tables
+    ]
+    return torch.cat(padded)
+
+
+@dataclass(frozen=True)
 class Gaussians:
     """Activated 3D Gaussians in the world frame."""
 
@@ -46,7 +93,7 @@ class Gaussians:
     """Standard deviations along the Gaussian's own axes, meters, >= 0."""
     opacities: Float[Tensor, " n"]
     """Peak alpha in [0, 1]; a row with opacity 0 is culled before projection."""
-    sh: Float[Tensor, "n k 3"]
+    sh: Float[Tensor, "n k 3"] | Harmonics
     """Spherical harmonics, k in {1, 4, 9, 16}; color = max(0, 0.5 + sum_i basis_i(direction) sh_i)."""
     displacements: Float[Tensor, "n 3"] | None = None
     """How far each row moves while an image is read out, meters in the world; None: nothing moves.
@@ -56,25 +103,44 @@ class Gaussians:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    def dense_sh(self) -> Float[Tensor, "n k 3"]:
+        """Return the harmonics as one table, which is a copy where nodes keep them."""
+        return self.sh.dense() if isinstance(self.sh, Harmonics) else self.sh
+
+    def columns(self) -> dict[str, Tensor]:
+        """Return the five fields that every row has, the harmonics as one table, by name."""
+        named = {name: getattr(self, name) for name in ("means", "quaternions", "scales", "opacities")}
+        return named | {"sh": self.dense_sh()}
+
+    def learned(self) -> tuple[Tensor, ...]:
+        """Means, quaternions, scales, opacities and the tables of harmonics: all that gets gradients."""
+        tables = self.sh.tables if isinstance(self.sh, Harmonics) else (self.sh,)
+        return self.means, self.quaternions, self.scales, self.opacities, *tables
+
+    @property
+    def terms(self) -> int | None:
+        """Coefficients in use of the tables of harmonics; None: there is one table, of which all are."""
+        return self.sh.terms if isinstance(self.sh, Harmonics) else None
+
+    @staticmethod
+    def of_learned(fields: Sequence[Tensor], terms: int | None, displacements: Tensor | None = None) -> "Gaussians":
+        """Return the Gaussians of which these are ``learned()`` and ``terms``."""
+        means, quaternions, scales, opacities, *tables = fields
+        half = len(tables) // 2
+        sh = tables[0] if terms is None else Harmonics(tuple(tables[:half]), tuple(tables[half:]), terms)
+        return Gaussians(means, quaternions, scales, opacities, sh, displacements)
+
     @staticmethod
     def concatenate(parts: "list[Gaussians]") -> "Gaussians":
         """Joins the rows of all parts in order; parts of a lower SH degree are padded with zeros."""
         if len(parts) == 1:
             return parts[0]
-        terms = max(part.sh.shape[1] for part in parts)
-        # pad copies even when it adds nothing, and the harmonics are most of a scene's memory traffic.
-        padded = [
-            part.sh
-            if part.sh.shape[1] == terms
-            else torch.nn.functional.pad(part.sh, (0, 0, 0, terms - part.sh.shape[1]))
-            for part in parts
-        ]
         return Gaussians(
             torch.cat([part.means for part in parts]),
             torch.cat([part.quaternions for part in parts]),
             torch.cat([part.scales for part in parts]),
             torch.cat([part.opacities for part in parts]),
-            torch.cat(padded),
+            _joined([part.dense_sh() for part in parts]),
             Gaussians._displacements(parts),
         )
 

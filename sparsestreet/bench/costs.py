@@ -77,8 +77,8 @@ class Street:
             "log_scales": made.scales.log(),
             "quaternions": made.quaternions,
             "opacity_logits": made.opacities.logit(),
-            "sh_dc": made.sh[:, :1],
-            "sh_rest": made.sh[:, 1:],
+            "sh_dc": made.dense_sh()[:, :1],
+            "sh_rest": made.dense_sh()[:, 1:],
         }
         view = replace(like, camera=frustum_camera(size.width, size.height))
         return Street({"street": Background(BackgroundSettings(), Rows(columns))}, view)

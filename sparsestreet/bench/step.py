@@ -92,8 +92,8 @@ def floors(work: Sequence[StepWork]) -> dict[str, Floor]:
 
 def _floors(work: StepWork) -> dict[str, Floor]:
     pixels, color = work.size[0] * work.size[1], 3 * work.terms
-    # Scales, opacity and coefficients are read raw and written activated.
-    assembly = Floor(NUMBER * 2 * work.rows * (4 + color))
+    # Scales and opacity are read raw and written activated.
+    assembly = Floor(NUMBER * 2 * work.rows * 4)
     read = work.rows * _SHAPE_NUMBERS + work.visible * color
     window_flops = 2 * 2 * WINDOW  # an 11-tap filter along two axes
     found = {

@@ -102,7 +102,8 @@ class OpTimes:
 
 def leaves(gaussians: Gaussians, dtype: torch.dtype, device: str | torch.device = "cpu") -> Gaussians:
     """A copy in this dtype on this device whose fields collect gradients."""
-    copies = {name: getattr(gaussians, name).detach().to(device, dtype, copy=True).requires_grad_() for name in GROUPS}
+    columns = gaussians.columns().items()
+    copies = {name: column.detach().to(device, dtype, copy=True).requires_grad_() for name, column in columns}
     moved = gaussians.displacements
     return replace(gaussians, **copies, displacements=None if moved is None else moved.to(device, dtype))
 

@@ -95,25 +95,24 @@ def frame_gaussians(
     if sky and skies and nodes is None and instances is None:
         reach = float(found.means.abs().max())
         dome = sky_dome(skies[0], min(max(2 * reach, _NEAREST), _FARTHEST))
-        found = Gaussians.concatenate([found, _discs(dome, found.sh.shape[1])])
+        found = Gaussians.concatenate([found, _discs(dome, found.dense_sh().shape[1])])
     return turned(found, VIEWER_FROM_WORLD)
 
 
 def selected(gaussians: Gaussians, rows: Tensor) -> Gaussians:
     """Return some rows, on the host."""
-    names = ("means", "quaternions", "scales", "opacities", "sh")
-    return Gaussians(*(getattr(gaussians, name)[rows].detach().cpu() for name in names))
+    return Gaussians(**{name: column[rows].detach().cpu() for name, column in gaussians.columns().items()})
 
 
 def turned(gaussians: Gaussians, rotation: Float[Tensor, "3 3"]) -> Gaussians:
     """Return the Gaussians as they are seen from axes that are turned: new = rotation @ old, harmonics as well."""
     turn = quat.from_matrix(rotation[None].double()).to(gaussians.quaternions)
-    terms = gaussians.sh.shape[1]
+    sh = gaussians.dense_sh()
     return replace(
         gaussians,
         means=gaussians.means @ rotation.T.to(gaussians.means),
         quaternions=quat.multiply(turn.expand(len(gaussians), 4), quat.normalized(gaussians.quaternions)),
-        sh=torch.einsum("ij,njc->nic", turned_harmonics(rotation, terms).to(gaussians.sh), gaussians.sh),
+        sh=torch.einsum("ij,njc->nic", turned_harmonics(rotation, sh.shape[1]).to(sh), sh),
     )
 
 

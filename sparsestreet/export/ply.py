@@ -1,6 +1,7 @@
 """Writes Gaussians as a .ply file in the layout of 3DGS, which the field's viewers and converters read."""
 
 from collections.abc import Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,6 @@ from sparsestreet.types import Camera, Gaussians, View
 
 _ANYWHERE = Camera(torch.eye(4), torch.eye(3), 1, 1)
 """A camera for views without indices, of which nodes use only the time."""
-
-_FIELDS = ("means", "quaternions", "scales", "opacities", "sh")
 
 _MAX_OPACITY = 1 - 2.0**-25
 """Halfway between 1 and the largest float32 below 1. Its logit is finite, and the sigmoid of this logit is 1 again."""
@@ -49,7 +48,7 @@ def write_ply(path: Path | str, gaussians: Gaussians, *, antialiased: bool = Fal
     if not len(table):
         raise ValueError("a ply needs a Gaussian with an opacity above 0, got none: choose more, or another time")
     with atomic_file(Path(path)) as temporary, temporary.open("wb") as file:
-        file.write(_header(len(table), gaussians.sh.shape[1], antialiased).encode("ascii"))
+        file.write(_header(len(table), gaussians.dense_sh().shape[1], antialiased).encode("ascii"))
         file.write(table.tobytes())
     return len(table)
 
@@ -60,7 +59,7 @@ def check_gaussians(gaussians: Gaussians, of: str = "", rows: slice = slice(None
     Every writer asks before it leaves rows out: a comparison of opacities drops those that are NaN. ``of``: what is
     said behind a field's name.
     """
-    check_finite({f"{name}{of}": getattr(gaussians, name).detach()[rows] for name in _FIELDS}, DAMAGED)
+    check_finite({f"{name}{of}": column.detach()[rows] for name, column in gaussians.columns().items()}, DAMAGED)
 
 
 @torch.no_grad()
@@ -88,14 +87,14 @@ def scene_gaussians(
         raise ValueError("Gaussians are chosen by nodes or by instances, got both: leave one out")
     check_numbers(stored.scene)
     placed = stored.scene.gaussians_at(View(_ANYWHERE, time))
+    placed = replace(placed, gaussians=replace(placed.gaussians, sh=placed.gaussians.dense_sh()))
     for name, rows in placed.spans.items():
         check_gaussians(placed.gaussians, f" of node {name}", rows)
     if instances is not None:
         keep = _rows_of_instances(stored, placed, instances, time)
     else:
         keep = _rows_of_nodes(placed, placed.spans if nodes is None else nodes)
-    chosen = placed.gaussians
-    return Gaussians(*(getattr(chosen, name)[keep] for name in _FIELDS))
+    return Gaussians(**{name: column[keep] for name, column in placed.gaussians.columns().items()})
 
 
 def instance_names(stored: StoredScene) -> list[str]:
@@ -155,7 +154,7 @@ def _known(kind: str, names: Collection[str], known: Collection[str]) -> None:
 def _vertices(gaussians: Gaussians) -> Float[np.ndarray, "n p"]:
     """Return one row a vertex, its properties in the order of the header, little endian."""
     keep = gaussians.opacities > 0
-    values = {name: getattr(gaussians, name).detach()[keep].cpu() for name in _FIELDS}
+    values = {name: column.detach()[keep].cpu() for name, column in gaussians.columns().items()}
     opacities = values["opacities"].double().clamp(max=_MAX_OPACITY)
     columns = (
         values["means"],

@@ -178,11 +178,12 @@ def _seen_colors(looks: Sequence[tuple[RawGaussians, Rig]]) -> Float[Tensor, "n 
     total, weight = torch.zeros_like(first), torch.zeros_like(first[:, :1])
     for raw, rig in looks:
         world = activate([raw], sh_degree=FINISHED.sh_degree)
+        sh = world.dense_sh()
         for view in rig:
             _, depths, inside = project(view.camera, world.means)
             near = torch.where(inside & (world.opacities > 0), depths.clamp(min=1).square().reciprocal(), 0.0)[:, None]
             directions = world.means - view.camera.position.to(world.means)
-            total = total + near * view_colors(world.sh, directions, clamped=True)
+            total = total + near * view_colors(sh, directions, clamped=True)
             weight = weight + near
     plain = view_colors(looks[0][0].sh_dc, torch.ones_like(first), clamped=True)
     return torch.where(weight > 0, total / weight.clamp(min=1e-12), plain)

@@ -54,7 +54,7 @@ def write_spz(path: Path, gaussians: Gaussians, *, antialiased: bool = False) ->
     found = turned(gaussians, _RIGHT_UP_BACK)
     if len(found) > MAX_COUNT:
         raise ValueError(f"a .spz holds at most {MAX_COUNT:,} Gaussians, got {len(found):,}: prune, or choose nodes")
-    means, sh = found.means.double().numpy(), found.sh.double().numpy()
+    means, sh = found.means.double().numpy(), found.dense_sh().double().numpy()
     bits = _fraction_bits(float(np.abs(means).max(initial=0)))
     degree = {1: 0, 4: 1, 9: 2, 16: 3}[sh.shape[1]]
     logs = np.log(np.maximum(found.scales.double().numpy(), 1e-30))
@@ -81,7 +81,8 @@ def spz_notes(gaussians: Gaussians) -> list[str]:
         if step > NOTED:
             away = float(means[row].norm()) / 1000
             notes.append(f"positions are kept to {1000 * step:.3g} mm, because row {row} lies {away:,.4g} km away")
-    logs, first, rest = gaussians.scales.double().log(), gaussians.sh[:, 0], gaussians.sh[:, 1:]
+    logs, sh = gaussians.scales.double().log(), gaussians.dense_sh()
+    first, rest = sh[:, 0], sh[:, 1:]
     beyond = {
         "scales are cut to 365 m": int((logs > 255 / 16 - 10 + 1 / 32).any(1).sum()),
         "colors are cut to -3.3 to 3.3": int((first.abs() > 0.5 / _COLOR_SCALE + 0.01).any(1).sum()),

@@ -8,44 +8,46 @@ from torch import Tensor
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.ops.backend import disable_compile, fused_backend
-from sparsestreet.ops.raw import LEARNED, OPACITY_LOGIT_LIMIT, Placement, RawGaussians
+from sparsestreet.ops.raw import LEARNED, OPACITY_LOGIT_LIMIT, Placement, RawGaussians, harmonics_of
 from sparsestreet.types import Gaussians
 
 
 @disable_compile
 def activate(parts: Sequence[RawGaussians], *, sh_degree: int, backend: str = "auto") -> Gaussians:
-    """Activates all parts into one table: scales exp(s), opacities sigmoid(o) (3DGS), coefficients up to a degree.
+    """Activates all parts into one table: scales exp(s), opacities sigmoid(o) (3DGS). Harmonics stay in the parts' own.
 
-    Gradients go to everything that is learned. A part with fewer coefficients than another is padded with zeros. The
-    C++ library needs one operation and one backward for all parts and instances. Triton runs one kernel per part, torch
-    a few dozen operations. Two runs agree to the last bit, except with torch on a GPU, which sums the gradients of
-    poses by atomics.
+    Gradients go to everything that is learned. The C++ library needs one operation and one backward for all parts and
+    instances. Triton runs one kernel per part, torch a few dozen operations. Two runs agree to the last bit, except
+    with torch on a GPU, which sums the gradients of poses by atomics.
 
     ``backend``: "torch", "cpu", "triton" or "auto"; raises as :func:`sparsestreet.ops.backend.fused_backend`.
     """
     numbers = [tensor for part in parts for tensor in part.tensors()[:LEARNED] if tensor is not None]
     chosen = fused_backend(backend, *numbers)
     if chosen == "cpu":
-        from sparsestreet.ops.cpu.rows import activate as cpu_activate
+        from sparsestreet.ops.cpu.rows import activate as activated
+    elif chosen == "triton":
+        from sparsestreet.ops.triton.activate import activate as activated
+    else:
+        activated = _activate
+    sh = harmonics_of(parts, sh_degree)
+    return Gaussians.of_learned((*activated(parts), *sh.tables), sh.terms)
 
-        return cpu_activate(parts, sh_degree)
-    if chosen == "triton":
-        from sparsestreet.ops.triton.activate import activate as triton_activate
 
-        return triton_activate(parts, sh_degree)
-    return Gaussians.concatenate([_activated(part, part.terms(sh_degree)) for part in parts])
+def _activate(parts: Sequence[RawGaussians]) -> Sequence[Tensor]:
+    columns = zip(*map(_activated, parts), strict=True)
+    return [torch.cat(column) if len(parts) > 1 else column[0] for column in columns]
 
 
-def _activated(raw: RawGaussians, terms: int) -> Gaussians:
+def _activated(raw: RawGaussians) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     opacities = torch.sigmoid(raw.opacity_logits.clamp(-OPACITY_LOGIT_LIMIT, OPACITY_LOGIT_LIMIT))
     scales = torch.exp(raw.log_scales)
     if raw.multipliers is not None:
         opacities, scales = opacities * raw.multipliers, scales * raw.multipliers[:, None]
-    sh = torch.cat((raw.sh_dc, raw.sh_rest[:, : terms - 1]), dim=1) if terms > 1 else raw.sh_dc
     if raw.placement is None:
-        return Gaussians(raw.means, raw.quaternions, scales, opacities, sh)
+        return raw.means, raw.quaternions, scales, opacities
     means, quaternions, presence = _placed(raw, raw.placement)
-    return Gaussians(means, quaternions, scales, opacities * presence, sh)
+    return means, quaternions, scales, opacities * presence
 
 
 def _placed(

@@ -1,7 +1,9 @@
 """What a backend returns to the op, before the background is added, what it gathers beside gradients, or raises."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -42,6 +44,20 @@ class Raster:
     """Sum over splats of weight times depth, meters."""
     radii: Float[Tensor, " n"]
     """Half the longer side of the opacity-aware box, pixels; 0 for a culled row."""
+
+
+SHAPE = 4
+"""Number of the fields of ``Gaussians.learned`` before the tables of harmonics."""
+
+
+def empty_gradients(fields: Sequence[Tensor], terms: int | None, asked: Sequence[bool]) -> list[Tensor | None]:
+    """Unwritten gradients of ``Gaussians.learned``. As in torch, coefficients behind the first have none where no
+    gradient is asked for, or none of them is in use: an optimizer then skips them."""
+    rests = len(fields) if terms is None else SHAPE + (len(fields) - SHAPE) // 2
+    return [
+        torch.empty_like(field) if place < rests or (asked[place] and min(terms or 1, 1 + field.shape[1]) > 1) else None
+        for place, field in enumerate(fields)
+    ]
 
 
 COUNTINGS = 3

@@ -7,10 +7,12 @@ from typing import cast
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from sparsestreet.types import Harmonics
+
 OPACITY_LOGIT_LIMIT = 15.0
 """sigmoid(15) = 1 - 3e-7. Beyond it float32 has no gradient left, and exp could overflow."""
-INPUTS, LEARNED = 11, 9
-"""Number of a part's tensors, and how many of them, the first ones, are floating point with gradients."""
+INPUTS, LEARNED = 9, 7
+"""Number of the tensors of a part that are activated, and how many of them, the first ones, have gradients."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class Placement:
 
 
 Inputs = tuple[
-    Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+    Tensor, Tensor, Tensor, Tensor,
     Tensor | None, Tensor | None, Tensor | None, Tensor | None, Tensor | None,
 ]  # fmt: skip
 """A part as backends take it; see :meth:`RawGaussians.tensors`."""
@@ -60,8 +62,8 @@ class RawGaussians:
         return self.means.shape[0]
 
     def tensors(self) -> Inputs:
-        """The six fields, multipliers, the poses' quaternions and translations, instances and presence, in order."""
-        fields = (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh_dc, self.sh_rest)
+        """Four fields, multipliers, the poses' quaternions and translations, instances and presence, in order."""
+        fields = (self.means, self.log_scales, self.quaternions, self.opacity_logits)
         if self.placement is None:
             return *fields, self.multipliers, None, None, None, None
         poses, instances = self.placement.poses, self.placement.instances
@@ -70,6 +72,12 @@ class RawGaussians:
     def terms(self, sh_degree: int) -> int:
         """Number of coefficients in use up to a degree; rows that store fewer use all of theirs."""
         return min((sh_degree + 1) ** 2, 1 + self.sh_rest.shape[1])
+
+
+def harmonics_of(parts: Sequence[RawGaussians], sh_degree: int) -> Harmonics:
+    """Return the parts' own tables, of which all coefficients up to a degree are in use."""
+    terms = max(part.terms(sh_degree) for part in parts)
+    return Harmonics(tuple(part.sh_dc for part in parts), tuple(part.sh_rest for part in parts), terms)
 
 
 def split_parts(tensors: Sequence[Tensor | None]) -> list[tuple[slice, Inputs]]:

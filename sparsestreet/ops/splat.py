@@ -161,8 +161,7 @@ def _screen_offsets(gaussians: Gaussians, wanted: bool, filled: bool) -> Float[T
     """A leaf of zeros. It is in the graph only if it is wanted and a field of the Gaussians is in the graph.
 
     ``filled``: whether it has memory of its own, for a backend that reads it; else all rows share one zero."""
-    fields = (gaussians.means, gaussians.quaternions, gaussians.scales, gaussians.opacities, gaussians.sh)
-    wanted = wanted and torch.is_grad_enabled() and any(field.requires_grad for field in fields)
+    wanted = wanted and torch.is_grad_enabled() and any(field.requires_grad for field in gaussians.learned())
     means, shape = gaussians.means, (len(gaussians), 2)
     offsets = means.new_zeros(shape) if filled else _zero(means.dtype, means.device).expand(shape)
     return offsets.requires_grad_() if wanted else offsets

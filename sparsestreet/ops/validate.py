@@ -10,7 +10,7 @@ from torch import Tensor
 
 from sparsestreet.finite import check_finite, check_rows
 from sparsestreet.geometry.cameras import numbers_of
-from sparsestreet.types import Camera, Gaussians, Side
+from sparsestreet.types import Camera, Gaussians, Harmonics, Side
 
 LONGEST_SIDE = 1 << 22
 """Longest side of an image, pixels: up to here all pixel centers are exact in float32."""
@@ -25,7 +25,8 @@ MAX_DISTORTION = 1e12
 _GOOD: set[tuple[object, ...]] = set()
 """Numbers of cameras that were found good; a log has some thousands."""
 _MOST_GOOD = 1 << 14
-_SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
+_SHAPES = {"means": (3,), "quaternions": (4,), "scales": (3,), "opacities": ()}
+_TERMS = (1, 4, 9, 16)
 
 
 def check_dtype(gaussians: Gaussians, who: str) -> None:
@@ -43,28 +44,50 @@ def check_structure(gaussians: Gaussians, camera: Camera, background: Tensor | N
     It reads neither values of Gaussians nor anything on a GPU, so it is cheap and never waits.
     """
     means, rows = gaussians.means, gaussians.means.shape[0]
-    dtype, device = means.dtype, means.device
     for name, tail in _SHAPES.items():
-        field = getattr(gaussians, name)
-        # Harmonics have any number of terms.
-        expected = (rows, field.shape[1], *tail[1:]) if tail[:1] == (None,) and field.dim() > 1 else (rows, *tail)
-        if field.shape != expected:
-            text = f"[{', '.join('k' if want is None else str(want) for want in (rows, *tail))}]"
-            raise ValueError(f"{name} must have shape {text} like the {rows} rows of means, got {list(field.shape)}")
-        if field.dtype != dtype or field.device != device:
-            raise ValueError(
-                f"all fields must share one dtype and device: means is {means.dtype} on {means.device}, {name} is "
-                f"{field.dtype} on {field.device}; convert them with .to(means)"
-            )
+        _check_field(name, getattr(gaussians, name), (rows, *tail), means)
+    if isinstance(gaussians.sh, Harmonics):
+        _check_tables(gaussians.sh, means)
+    else:
+        # They have any number of terms.
+        _check_field("sh", gaussians.sh, (rows, gaussians.sh.shape[1] if gaussians.sh.dim() > 1 else None, 3), means)
     if not means.dtype.is_floating_point:
         raise ValueError(f"means must be floating point, got {means.dtype}: convert the Gaussians to float32")
-    if gaussians.sh.shape[1] not in (1, 4, 9, 16):
-        raise ValueError(f"sh must hold 1, 4, 9 or 16 terms (degree 0 to 3), got {gaussians.sh.shape[1]}")
+    terms = gaussians.sh.terms if isinstance(gaussians.sh, Harmonics) else gaussians.sh.shape[1]
+    if terms not in _TERMS:
+        raise ValueError(f"sh must hold 1, 4, 9 or 16 terms (degree 0 to 3), got {terms}")
     check_camera(camera)
     if gaussians.displacements is not None:
         _check_like(means, "displacements", gaussians.displacements, means.shape, "give one row of meters per Gaussian")
     if background is not None:
         _check_background(background, camera, means)
+
+
+def _check_field(name: str, field: Tensor, expected: tuple[int | None, ...], means: Tensor) -> None:
+    if field.shape != expected:
+        text = f"[{', '.join('k' if want is None else str(want) for want in expected)}]"
+        raise ValueError(f"{name} must have shape {text} like the {len(means)} rows of means, got {list(field.shape)}")
+    if field.dtype != means.dtype or field.device != means.device:
+        raise ValueError(
+            f"all fields must share one dtype and device: means is {means.dtype} on {means.device}, {name} is "
+            f"{field.dtype} on {field.device}; convert them with .to(means)"
+        )
+
+
+def _check_tables(sh: Harmonics, means: Tensor) -> None:
+    """Tables of harmonics in pairs, which together have the rows of the means."""
+    counts = [len(first) for first in sh.first]
+    if [len(rest) for rest in sh.rest] != counts or sum(counts) != len(means):
+        raise ValueError(
+            f"the tables of sh must have the {len(means)} rows of means together, and first and rest the same, got "
+            f"{counts} and {[len(rest) for rest in sh.rest]}"
+        )
+    for first, rest in zip(sh.first, sh.rest, strict=True):
+        stored = rest.shape[1] if rest.dim() > 1 else None
+        if stored is not None and stored + 1 not in _TERMS:
+            raise ValueError(f"sh.rest must store 0, 3, 8 or 15 coefficients (degree 0 to 3), got {stored}")
+        _check_field("sh.first", first, (len(first), 1, 3), means)
+        _check_field("sh.rest", rest, (len(rest), stored, 3), means)
 
 
 def _check_like(means: Tensor, name: str, values: Tensor, shape: tuple[int, ...], remedy: str) -> None:
@@ -116,11 +139,12 @@ def check_values(gaussians: Gaussians, drawn: Bool[Tensor, " n"] | None = None) 
     """
     opacities, scales = gaussians.opacities.detach(), gaussians.scales.detach()
     masked = opacities == 0
-    for name in (*_SHAPES, *(() if gaussians.displacements is None else ("displacements",))):
-        field, unread = getattr(gaussians, name).detach(), masked
-        if name == "sh" and drawn is not None:
-            unread = ~drawn
-        check_finite({name: field}, "check what computed it", unread=unread)
+    fields = gaussians.columns()
+    if gaussians.displacements is not None:
+        fields["displacements"] = gaussians.displacements
+    for name, field in fields.items():
+        unread = ~drawn if name == "sh" and drawn is not None else masked
+        check_finite({name: field.detach()}, "check what computed it", unread=unread)
     inside = (opacities >= 0) & (opacities <= 1)
     check_rows("opacities", opacities, inside, "must lie in [0, 1]", "apply the sigmoid", unread=masked)
     check_rows("scales", scales, scales >= 0, "must be >= 0 meters", "apply the exponential", unread=masked)

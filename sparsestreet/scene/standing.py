@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from sparsestreet.ops.activate import activate
-from sparsestreet.ops.raw import LEARNED, RawGaussians
+from sparsestreet.ops.raw import LEARNED, RawGaussians, harmonics_of
 from sparsestreet.scene.effects.effect import Effect
 from sparsestreet.scene.graph import SceneGaussians, SceneGraph
 from sparsestreet.scene.nodes.node import Node
@@ -21,7 +21,7 @@ class StandingScene(SceneGraph):
     The first nodes stand still if they answer with the parameters that they store, unmasked and unplaced, as a
     background does. Their activated rows stay at the head of a table, and each frame writes the rows of all other nodes
     behind them. So **what a frame got holds until the next frame**, also of a scene that was made of this one with
-    other nodes or effects: both share the table. It takes as much memory as the rows, all 59 numbers of each.
+    other nodes or effects: both share the table. It takes 11 numbers a row: harmonics are read where nodes keep them.
 
     The rows are activated anew where a parameter is another tensor, has moved, or was changed in place, by torch's own
     count of changes: optimizer steps, ``load_state_dict``, ``to``, ``Rows.resize``. Only what writes past torch, into
@@ -67,7 +67,7 @@ def _stands_still(part: RawGaussians) -> bool:
 
 
 def _stored(part: RawGaussians) -> list[Tensor]:
-    """The numbers of a part, those of its mask and poses included."""
+    """The numbers that a part's rows are activated from, those of its mask and poses included."""
     return [tensor for tensor in part.tensors()[:LEARNED] if tensor is not None]
 
 
@@ -98,36 +98,33 @@ class _KeptRows:
 
     def joined(self, still: Sequence[RawGaussians], others: Sequence[RawGaussians], sh_degree: int) -> Gaussians:
         """Activate all parts as ``ops.activate`` does, into the table; the answer is views of it."""
-        count = sum(map(len, (*still, *others)))
-        terms = max(part.terms(sh_degree) for part in (*still, *others))
+        parts = (*still, *others)
+        count = sum(map(len, parts))
         # Outside of inference mode, whose tensors could not be written to in a later frame.
         with torch.inference_mode(False), torch.no_grad():
-            if not self._fits(still, count, terms):
-                self._make(still, count, terms, sh_degree)
+            if not self._fits(still, count):
+                self._make(still, count, sh_degree)
             if others:
                 self._write(activate(others, sh_degree=sh_degree), self._head)
-        return Gaussians(*(column[:count] for column in self._columns))
+        sh = harmonics_of(parts, sh_degree)
+        return Gaussians.of_learned((*(column[:count] for column in self._columns), *sh.tables), sh.terms)
 
-    def _fits(self, still: Sequence[RawGaussians], count: int, terms: int) -> bool:
+    def _fits(self, still: Sequence[RawGaussians], count: int) -> bool:
         stored = [tensor for part in still for tensor in _stored(part)]
-        if len(stored) != len(self._marks) or len(self._columns[0]) < count or self._columns[-1].shape[1] != terms:
+        if len(stored) != len(self._marks) or len(self._columns[0]) < count:
             return False
         return all(mark.holds_for(tensor) for mark, tensor in zip(self._marks, stored, strict=True))
 
-    def _make(self, still: Sequence[RawGaussians], count: int, terms: int, sh_degree: int) -> None:
+    def _make(self, still: Sequence[RawGaussians], count: int, sh_degree: int) -> None:
         rows = activate(still, sh_degree=sh_degree)
         means = rows.means
-        self._columns = tuple(means.new_zeros(count, *width) for width in ((3,), (4,), (3,), (), (terms, 3)))
+        self._columns = tuple(means.new_zeros(count, *width) for width in ((3,), (4,), (3,), ()))
         self._write(rows, 0)
         self._head = len(rows)
         self._marks = [_Mark.of(tensor) for part in still for tensor in _stored(part)]
 
     def _write(self, rows: Gaussians, first: int) -> None:
-        """Put rows at a place of the table; coefficients that they have not are 0 there."""
-        numbers = (rows.means, rows.quaternions, rows.scales, rows.opacities, rows.sh)
+        """Put rows at a place of the table."""
+        numbers = (rows.means, rows.quaternions, rows.scales, rows.opacities)
         for column, values in zip(self._columns, numbers, strict=True):
-            here = column[first : first + len(rows)]
-            if values.dim() == 3:
-                here[:, values.shape[1] :] = 0
-                here = here[:, : values.shape[1]]
-            here.copy_(values)
+            column[first : first + len(rows)] = values

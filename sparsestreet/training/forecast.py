@@ -151,8 +151,9 @@ log = logging.getLogger(__name__)
 
 COPIES = 3
 """Of each column, always: values and Adam's two moments."""
-ACTIVATED = 4 * 59
-"""Bytes of a Gaussian as it is drawn, with harmonics of degree 3. Its gradient takes as much, for each view."""
+ACTIVATED = 4 * 11
+"""Bytes of a Gaussian as it is drawn, but its harmonics, which are read from their columns. Its gradient takes as
+much."""
 STATISTICS = 16 + 8
 """Bytes a Gaussian of density control, and of the gradient on screen that it reads."""
 SCREEN = 4 * 12 + 2 * 4 + 3 * 4
@@ -182,7 +183,7 @@ def foreseen_bytes(rows: int, row_bytes: float, pixels: int, *, moved: bool = Tr
         moved: whether some steps render a second view (``training.moved_views``).
 
     >>> f"{foreseen_bytes(5_000_000, 236.0, 1920 * 1280) / 1e9:.1f} GB"
-    '9.7 GB'
+    '8.7 GB'
     """
     return rows * _bytes_a_row(row_bytes, moved) + PIXEL_BYTES * pixels
 
@@ -190,7 +191,7 @@ def foreseen_bytes(rows: int, row_bytes: float, pixels: int, *, moved: bool = Tr
 def _bytes_a_row(row_bytes: float, moved: bool) -> float:
     views = 2 if moved else 1
     held = COPIES * row_bytes + ACTIVATED + STATISTICS + views * (SCREEN + PAIRS * PAIR)
-    of_splats = views * ACTIVATED + SUMS + PAIRS * SLOT
+    of_splats = views * row_bytes + SUMS + PAIRS * SLOT  # of what is drawn, as many numbers as the columns have
     of_columns = ACTIVATED + row_bytes
     return held + max(of_splats, of_columns)
 

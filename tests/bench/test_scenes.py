@@ -32,7 +32,7 @@ def test_five_scenes_the_same_every_time():
     for a, b in zip(first, again, strict=True):
         assert all(torch.equal(getattr(a.gaussians, name), getattr(b.gaussians, name)) for name in FIELDS)
         assert len(a.gaussians) == SIZE.rows
-        assert a.gaussians.sh.shape == (SIZE.rows, 16, 3)
+        assert a.gaussians.dense_sh().shape == (SIZE.rows, 16, 3)
 
 
 def test_deep_stack_is_as_deep_as_it_says():
@@ -78,7 +78,7 @@ def test_most_of_the_proxy_is_seen():
     street = bench_scenes(SIZE)[3]
     visible = visible_rows(street.gaussians, street.camera, SplatSettings())
     assert len(visible) > 0.6 * SIZE.rows
-    assert bool(torch.isfinite(street.gaussians.sh).all())
+    assert bool(torch.isfinite(street.gaussians.dense_sh()).all())
 
 
 def test_the_camera_of_a_frustum():
@@ -104,8 +104,8 @@ def test_a_frustum_is_filled_evenly():
     logs = (found.scales / depth[:, None] * 96).log()
     assert logs.mean(0).tolist() == pytest.approx([math.log(3.0)] * 3, abs=0.02)
     assert logs.std(0).tolist() == pytest.approx([0.5] * 3, rel=0.03)
-    assert found.sh.shape == (rows, 4, 3)
-    assert float(found.sh.std()) == pytest.approx(0.3, rel=0.02)
+    assert found.dense_sh().shape == (rows, 4, 3)
+    assert float(found.dense_sh().std()) == pytest.approx(0.3, rel=0.02)
     assert float(found.quaternions.std()) == pytest.approx(1.0, rel=0.02)
 
 
@@ -145,7 +145,7 @@ def test_the_proxy_is_what_it_was():
     """Its times are compared over years."""
     street = proxy_street(20_000, terms=4)
     columns = {name: getattr(street, name) for name in ("means", "scales", "opacities", "quaternions")}
-    columns |= {"constant": street.sh[:, 0], "others": street.sh[:, 1:].flatten()}
+    columns |= {"constant": street.dense_sh()[:, 0], "others": street.dense_sh()[:, 1:].flatten()}
     found = {name: torch.stack((each.mean(0), each.std(0))).flatten().tolist() for name, each in columns.items()}
     # Draws are equal on every processor but for their last digits.
     assert found == {name: pytest.approx(numbers, rel=1e-3, abs=1e-4) for name, numbers in PROXY.items()}

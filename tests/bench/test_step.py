@@ -63,8 +63,8 @@ RECORD = StepRecord(
 def test_bytes_by_hand():
     found = floors([WORK])
     assert found["optimizer"].bytes == 50 * 7 * 4
-    # Three scales, an opacity and 4 x 3 coefficients of 10 rows, read and written.
-    assert found["scene"].bytes == found["scene backward"].bytes == 2 * 10 * 16 * 4
+    # Three scales and an opacity of 10 rows, read and written.
+    assert found["scene"].bytes == found["scene backward"].bytes == 2 * 10 * 4 * 4
     # 11 numbers of all rows and 12 of the four that are drawn are read; 11 + 12 + 2 of all rows are written.
     assert found["splat"].bytes == 4 * (110 + 48)
     assert found["splat backward"].bytes == 4 * (110 + 48 + 250)

@@ -71,7 +71,7 @@ def test_small_splats_are_together_as_wide_as_theirs():
         size = rotation @ torch.diag(small.gaussians.scales[own][0] ** 2) @ rotation.T
         off = rotation.T @ (torch.cov(places.T) + size - covariance) @ rotation / (scales[row][:, None] * scales[row])
         assert off.abs().max() < 4 * (2 / 3600) ** 0.5
-        assert torch.equal(small.gaussians.sh[own], whole.sh[row].expand(3600, 4, 3))
+        assert torch.equal(small.gaussians.dense_sh()[own], whole.dense_sh()[row].expand(3600, 4, 3))
         assert bool((small.gaussians.opacities[own] == whole.opacities[row]).all())
 
 

@@ -86,8 +86,10 @@ def test_a_key_of_an_earlier_version_has_one_clear_error(log):
         data_of(as_a(DictConfig, old))
 
 
-@pytest.mark.parametrize(("resume", "summary"), [(None, make_summary(psnr=21.5)), ("some/run", None)])
-def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, resume, summary):
+@pytest.mark.parametrize(("resume", "summary"), [(None, make_summary(psnr=21.5)), ("run", None)])
+def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, tmp_path_factory, resume, summary):
+    monkeypatch.chdir(tmp_path_factory.mktemp("elsewhere"))
+    Path("run").mkdir()
     words = [*WORDS, *([f"resume={resume}"] if resume else [])]
     called: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
     order: list[str] = []
@@ -106,7 +108,7 @@ def test_a_run_hands_on_what_its_configuration_says(log, monkeypatch, tmp_path, 
         "keep_freed_memory",
         "forget_peaks",
         "silence_known_noise",
-        f"take {tmp_path.name} False",  # some/run lies elsewhere
+        f"take {tmp_path.name} False",  # the other run lies elsewhere
     ]
     assert (recipe.seed, data.driving_log, out) == (7, log, tmp_path)
     assert (how["max_steps"], how["checkpoint_every"]) == (90, 30)

@@ -41,7 +41,7 @@ def test_objects_stand_where_they_were_once_their_poses_are_applied(tmp_path: Pa
             found, expected = placed(folder, one, time), scene_gaussians(stored, time, instances=[one["name"]])
             # float32, turned there and back.
             assert torch.allclose(found.means, expected.means, atol=2e-5)
-            assert torch.allclose(found.sh, expected.sh, atol=2e-5)
+            assert torch.allclose(found.dense_sh(), expected.dense_sh(), atol=2e-5)
             assert torch.allclose(found.scales, expected.scales, rtol=1e-4)
 
 

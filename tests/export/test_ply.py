@@ -44,11 +44,11 @@ def test_plyfile_reads_the_same_gaussians(tmp_path):
     torch.testing.assert_close(columns(path, "opacity").sigmoid().squeeze(1), written.opacities, rtol=1e-6, atol=0)
     unit = written.quaternions / written.quaternions.norm(dim=1, keepdim=True)
     torch.testing.assert_close(columns(path, *numbered("rot", 4)), unit, rtol=0, atol=1e-7)
-    assert torch.equal(columns(path, *numbered("f_dc", 3)), written.sh[:, 0])
+    assert torch.equal(columns(path, *numbered("f_dc", 3)), written.dense_sh()[:, 0])
     for channel in range(3):
         for term in range(8):
             rest = columns(path, f"f_rest_{channel * 8 + term}").squeeze(1)
-            assert torch.equal(rest, written.sh[:, 1 + term, channel]), (channel, term)
+            assert torch.equal(rest, written.dense_sh()[:, 1 + term, channel]), (channel, term)
 
 
 def test_the_layout_is_inrias(tmp_path):
@@ -96,7 +96,7 @@ def test_a_scene_at_a_time_is_all_its_nodes():
     stored = stored_street()
     whole = scene_gaussians(stored, 0.0)
     assert len(whole) == ROAD_ROWS + CAR_ROWS + TRAM_ROWS
-    assert whole.sh.shape[1] == 9  # the background's degree; the objects' lower one is padded
+    assert whole.dense_sh().shape[1] == 9  # the background's degree; the objects' lower one is padded
     # The car starts at (8, 1, 1) without a turn.
     car = scene_gaussians(stored, 0.0, instances=["car"])
     box = stored.scene.nodes["rigid"].rows.means[:CAR_ROWS].detach()

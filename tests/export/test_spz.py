@@ -44,8 +44,8 @@ def assert_near(found: Gaussians, one: Gaussians, *, position: float, scale: flo
     assert torch.allclose(found.means, one.means, rtol=0, atol=position)
     assert torch.allclose(found.scales.log(), one.scales.log(), rtol=0, atol=scale)
     assert torch.allclose(found.opacities, one.opacities, rtol=0, atol=1 / 510 + 1e-6)
-    assert torch.allclose(found.sh[:, :1], one.sh[:, :1], rtol=0, atol=first)
-    assert torch.allclose(found.sh[:, 1:], one.sh[:, 1:], rtol=0, atol=harmonic)
+    assert torch.allclose(found.dense_sh()[:, :1], one.dense_sh()[:, :1], rtol=0, atol=first)
+    assert torch.allclose(found.dense_sh()[:, 1:], one.dense_sh()[:, 1:], rtol=0, atol=harmonic)
     unit = torch.nn.functional.normalize(one.quaternions, dim=1)
     # Three parts off by half of 0.0014, and the largest by what makes the whole a unit: at most twice that.
     assert float((1 - (found.quaternions * unit).sum(1).abs()).max()) < (2 * np.sqrt(3) * 0.0007) ** 2
@@ -133,7 +133,7 @@ def test_one_far_row_that_coarsens_all_others_is_said(tmp_path: Path):
 
 def test_what_a_spz_cuts_is_counted():
     one = gaussians(50)
-    one.scales[3, 1], one.sh[7, 2, 0], one.sh[8, 0, 1] = 1e20, 1.5, -4.0
+    one.scales[3, 1], one.dense_sh()[7, 2, 0], one.dense_sh()[8, 0, 1] = 1e20, 1.5, -4.0
     assert spz_notes(one) == [
         "of 1 Gaussians, scales are cut to 365 m",
         "of 1 Gaussians, colors are cut to -3.3 to 3.3",

@@ -10,7 +10,8 @@ from torch import Tensor
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.cpu import rows as fused
 from sparsestreet.ops.cpu.library import load_library
-from sparsestreet.ops.raw import OPACITY_LOGIT_LIMIT, Placement, Poses, RawGaussians
+from sparsestreet.ops.raw import LEARNED, OPACITY_LOGIT_LIMIT, Placement, Poses, RawGaussians, harmonics_of
+from sparsestreet.types import Gaussians
 from tests.ops.scenes import (
     CPU,
     device_of,
@@ -19,7 +20,6 @@ from tests.ops.scenes import (
     fill_buffers_with_nan,
     with_threads,
 )
-from tests.typed import there
 
 
 def raw_rows(count: int, rest: int, dtype=torch.float64, seed: int = 0, device: torch.device = CPU) -> RawGaussians:
@@ -50,12 +50,16 @@ def closed_every_third(count: int, dtype=torch.float64, device: torch.device = C
 
 def inputs_of(parts: list[RawGaussians]) -> list[Tensor]:
     """Fields, multipliers and poses."""
-    return [tensor for part in parts for tensor in part.tensors()[:9] if tensor is not None]
+    found = []
+    for part in parts:
+        shape, others = part.tensors()[:4], part.tensors()[4:LEARNED]
+        found += [tensor for tensor in (*shape, part.sh_dc, part.sh_rest, *others) if tensor is not None]
+    return found
 
 
-def values_and_gradients(parts: list[RawGaussians], run: Callable[[list[RawGaussians]], object]) -> list[Tensor]:
+def values_and_gradients(parts: list[RawGaussians], run: Callable[[list[RawGaussians]], Gaussians]) -> list[Tensor]:
     """Outputs, and the gradients of all inputs under a fixed random cotangent."""
-    outputs = [field for field in vars(run(parts)).values() if field is not None]
+    outputs = list(run(parts).columns().values())
     generator = torch.Generator().manual_seed(2)
     cotangents = [torch.randn(out.shape, generator=generator, dtype=torch.float64).to(out) for out in outputs]
     total = torch.stack([(out * cotangent).sum() for out, cotangent in zip(outputs, cotangents, strict=True)]).sum()
@@ -143,7 +147,7 @@ def test_gradients_are_those_of_finite_differences():
     def outputs(*values: Tensor) -> tuple[Tensor, ...]:
         where = Placement(Poses(values[7], values[8], torch.tensor([True, False, True])), torch.tensor([2, 0, 1, 0]))
         found = activate([RawGaussians(*values[:7], placement=where)], sh_degree=1, backend="cpu")
-        return tuple(field for field in vars(found).values() if field is not None)
+        return tuple(found.columns().values())
 
     assert torch.autograd.gradcheck(outputs, inputs)
 
@@ -195,37 +199,6 @@ def test_autocast_rounds_no_position():
     assert torch.equal(found, expected)
 
 
-@every_fast_backend
-def test_coefficients_that_are_not_used_get_no_gradient(backend):
-    raw = raw_rows(3, 15, torch.float32, device=device_of(backend))
-    sh = activate([raw], sh_degree=0, backend=backend).sh
-    v_dc, v_rest = torch.autograd.grad(sh.sum(), (raw.sh_dc, raw.sh_rest), allow_unused=True)
-    assert v_dc.tolist() == [[[1.0] * 3]] * 3
-    assert v_rest is None
-    (v_rest,) = torch.autograd.grad(activate([raw], sh_degree=1, backend=backend).sh.sum(), raw.sh_rest)
-    assert there(v_rest).sum((0, 2)).tolist() == [9.0] * 3 + [0.0] * 12
-
-
-@every_fast_backend
-@pytest.mark.parametrize("part", [0, 2])
-def test_coefficients_that_rest_change_no_other_gradient(backend, part):
-    """The first or the last of three parts lets them rest: it gets none, and all else gets what it got."""
-    parts = parts_of_three_kinds(torch.float32, device_of(backend))
-    resting = list(parts)
-    resting[part] = replace(parts[part], sh_rest=parts[part].sh_rest.detach())
-
-    def gradients(chosen: list[RawGaussians]) -> list[Tensor | None]:
-        active = activate(chosen, sh_degree=3, backend=backend)
-        total = torch.stack([(field * field).sum() for field in vars(active).values() if field is not None]).sum()
-        return list(torch.autograd.grad(total, inputs_of(parts), allow_unused=True))
-
-    usual, found = gradients(parts), gradients(resting)
-    place = next(i for i, one in enumerate(inputs_of(parts)) if one is parts[part].sh_rest)
-    assert found.pop(place) is None
-    assert there(usual.pop(place)).abs().sum() > 0
-    assert all(torch.equal(there(one), there(other)) for one, other in zip(found, usual, strict=True))
-
-
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_same_bits_for_any_number_of_threads(dtype):
     parts = case(15, masked=True, placed=True, count=2500, dtype=dtype)
@@ -241,7 +214,10 @@ def test_every_instruction_set(variant, dtype):
     if load_library().splat_variant_name(variant) is None:
         pytest.skip(f"this processor does not run variant {variant}")
     parts = case(15, masked=True, placed=True, count=37, dtype=dtype)
-    found = values_and_gradients(parts, lambda parts: fused.activate(parts, 3, variant))
+    sh = harmonics_of(parts, 3)
+    found = values_and_gradients(
+        parts, lambda parts: Gaussians.of_learned((*fused.activate(parts, variant), *sh.tables), sh.terms)
+    )
     expected = values_and_gradients(parts, lambda parts: activate(parts, sh_degree=3, backend="torch"))
     for value, truth in zip(found, expected, strict=True):
         torch.testing.assert_close(value, truth)

@@ -17,8 +17,8 @@ VIEW = camera(24, 16)
 
 def stored(count: int = 20) -> RawGaussians:
     drawn = cast(random_gaussians(count, VIEW), torch.float32)
-    logits = drawn.opacities.clamp(0.01, 0.99).logit()
-    fields = (drawn.means, drawn.scales.log(), drawn.quaternions, logits, drawn.sh[:, :1], drawn.sh[:, 1:])
+    logits, sh = drawn.opacities.clamp(0.01, 0.99).logit(), drawn.dense_sh()
+    fields = (drawn.means, drawn.scales.log(), drawn.quaternions, logits, sh[:, :1], sh[:, 1:])
     means, scales, quaternions, logits, first, rest = (values.detach().clone().requires_grad_() for values in fields)
     return RawGaussians(means, scales, quaternions, logits, first, rest)
 

@@ -22,7 +22,7 @@ def image():
     leaves = cast(scene, torch.float32, requires_grad=True)
     rgb = splat(leaves, view, backend="cpu").rgb
     rgb.sum().backward()
-    return rgb.detach(), leaves.sh.grad
+    return rgb.detach(), leaves.dense_sh().grad
 """
 WORKER = """
 import multiprocessing

@@ -198,9 +198,9 @@ def test_detached_colors_are_those_of_rows_without_a_direction(backend, dtype):
     """An independent oracle: rows that have the seen colors, clamped, as harmonics of degree 0."""
     view = camera(17, 13)
     rows = random_gaussians(12, view, terms=16, seed=3)
-    rows = replace(rows, sh=3 * rows.sh)
+    rows = replace(rows, sh=3 * rows.dense_sh())
     toward = torch.nn.functional.normalize(rows.means - view.position, dim=1)
-    colors = (0.5 + (basis(toward, 16)[..., None] * rows.sh).sum(1)).clamp(0, 1)
+    colors = (0.5 + (basis(toward, 16)[..., None] * rows.dense_sh()).sum(1)).clamp(0, 1)
     assert (colors == 1).any()
     assert (colors == 0).any()
     settings = SplatSettings(clamp_colors=True, detach_directions=True)
@@ -219,7 +219,7 @@ def test_detached_colors_are_those_of_rows_without_a_direction(backend, dtype):
 def test_gradients_of_clamped_colors_are_right(backend):
     view = camera(6, 5)
     rows = random_gaussians(8, view, terms=9, seed=3)
-    values = {name: getattr(rows, name).clone() for name in FIELDS} | {"sh": 3 * rows.sh}
+    values = {name: getattr(rows, name).clone() for name in FIELDS} | {"sh": 3 * rows.dense_sh()}
     settings = SplatSettings(alpha_min=1e-9, clamp_colors=True)
     for field in ("means", "sh"):
 

@@ -91,7 +91,7 @@ def test_harmonics_are_read_only_of_rows_that_are_drawn(backend, dtype):
     expected = render(gaussians, VIEW, backend, dtype)
     hidden = expected.radii == 0
     assert hidden.nonzero().flatten().tolist() == [3, 5, 7]
-    gaussians.sh[hidden] = torch.tensor([float("nan"), float("inf"), -float("inf")], dtype=torch.float64)
+    gaussians.dense_sh()[hidden] = torch.tensor([float("nan"), float("inf"), -float("inf")], dtype=torch.float64)
     result = render(gaussians, VIEW, backend, dtype)
     for part in ("images", "gradients"):
         for name, value in getattr(expected, part).items():
@@ -110,7 +110,7 @@ def test_any_coefficient_of_a_row_that_is_drawn(backend, dtype, terms):
         gaussians = one_gaussian(sh=[[[0.1] * 3] * terms])
         both = cast(type(gaussians).concatenate([gaussians] * 2), dtype, device=device_of(backend))
         place = min(place, 3 * terms - 1)
-        both.sh[row].view(-1)[place] = float("nan")
+        both.dense_sh()[row].view(-1)[place] = float("nan")
         for call in (splat, contribution, leave_one_out):
             with pytest.raises(ValueError, match=f"sh must be finite, but row {row} has nan"):
                 call(both, front_camera(3, 3, 5.0), backend=backend)

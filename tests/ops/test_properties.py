@@ -117,7 +117,7 @@ def test_moving_the_world_and_the_camera_together(backend, dtype, scene):
     gaussians, view, noise = scene
     gaussians, view = with_effects(gaussians, view, noise)
     turn, shift = to_matrix(noise[10:14]), 5 * noise[14:17]
-    if gaussians.sh.shape[1] > 1:  # Harmonics of higher degree are fixed to the world's axes.
+    if gaussians.dense_sh().shape[1] > 1:  # Harmonics of higher degree are fixed to the world's axes.
         turn = torch.eye(3, dtype=torch.float64)
     pose = torch.eye(4, dtype=torch.float64)
     pose[:3, :3], pose[:3, 3] = turn.T, -turn.T @ shift

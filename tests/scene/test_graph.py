@@ -33,11 +33,11 @@ def test_nodes_of_different_degree_are_padded():
     road = background(random_rows(2, 0, sh_degree=2))
     tree = background(random_rows(2, 1, sh_degree=0))
     scene = SceneGraph({"road": road, "tree": tree})
-    sh = scene.gaussians_at(VIEW).gaussians.sh
+    sh = scene.gaussians_at(VIEW).gaussians.dense_sh()
     assert sh.shape == (4, 9, 3)
     assert (sh[2:, 1:] == 0).all()
     assert torch.equal(sh[2:, :1], tree.rows.sh_dc)
-    assert scene.gaussians_at(VIEW, degree(1)).gaussians.sh.shape == (4, 4, 3)
+    assert scene.gaussians_at(VIEW, degree(1)).gaussians.dense_sh().shape == (4, 4, 3)
 
 
 @pytest.mark.parametrize("counts", [(0, 0), (0, 3), (3, 0)])

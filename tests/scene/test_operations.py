@@ -28,7 +28,8 @@ def operations(scene: SceneGraph) -> int:
     recorder.start()
     with CountedOperations(recorder, counts):
         placed = scene.gaussians_at(view_at(0.5), degree(3)).gaussians
-        torch.stack([(field * field).sum() for field in (placed.means, placed.scales, placed.sh)]).sum().backward()
+        fields = (placed.means, placed.scales, placed.dense_sh())
+        torch.stack([(field * field).sum() for field in fields]).sum().backward()
     recorder.stop()
     return sum(counts.values())
 

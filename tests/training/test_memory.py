@@ -20,7 +20,6 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import RenderOptions, SceneRendering, from_another_camera
 from sparsestreet.training import forecast
 from sparsestreet.training.forecast import (
-    ACTIVATED,
     PAIR,
     PAIRS,
     PIXEL_BYTES,
@@ -48,7 +47,7 @@ def test_the_forecast_is_what_a_device_needed():
     ours = [one for one in records if one.get("renderer") == "sparsestreet triton" and one["rows"] >= 1_500_000]
     assert len(ours) == 4
     for one in ours:
-        needed = one["rows"] * (2 * ACTIVATED + SCREEN + SUMS) + one["pairs"] * (PAIR + SLOT)
+        needed = one["rows"] * (2 * COLUMNS + SCREEN + SUMS) + one["pairs"] * (PAIR + SLOT)
         assert needed + PIXEL_BYTES * one["width"] * one["height"] == pytest.approx(1e6 * one["memory_peak"], rel=1 / 8)
 
 
@@ -151,11 +150,11 @@ def test_what_may_not_fit_is_warned_of_and_a_start_that_does_not_is_an_error():
     assert memory_problem(1_000, 2_000, COLUMNS, 100, less, moved=False) is None
     said = memory_problem(1_000_000, 2_000_000, COLUMNS, 100, 3e9)
     assert said == (
-        "the scene may outgrow the device: 2,000,000 Gaussians and an image of 100 pixels need about 3.8 GB, and the "
+        "the scene may outgrow the device: 2,000,000 Gaussians and an image of 100 pixels need about 3.4 GB, and the "
         "device has 3.0 GB: lower max_gaussians of the largest nodes, or the size of the images. More processes do not "
         "help, since each holds all Gaussians"
     )
-    with pytest.raises(ValueError, match=r"^1,000,000 Gaussians .* about 1.9 GB, and the device has 1.0 GB: lower"):
+    with pytest.raises(ValueError, match=r"^1,000,000 Gaussians .* about 1.7 GB, and the device has 1.0 GB: lower"):
         memory_problem(1_000_000, 2_000_000, COLUMNS, 100, 1e9)
 
 

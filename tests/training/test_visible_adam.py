@@ -126,7 +126,7 @@ def test_the_op_says_what_a_view_has_seen():
     leaves = cast(Gaussians.concatenate([shown, behind]), torch.float32, requires_grad=True)
     rendering = splat(leaves, view)
     (rendering.rgb.square().sum() + rendering.alpha.sum()).backward()
-    for field in (leaves.means, leaves.quaternions, leaves.scales, leaves.opacities, leaves.sh):
+    for field in (leaves.means, leaves.quaternions, leaves.scales, leaves.opacities, leaves.dense_sh()):
         seen = seen_rows(there(field.grad))
         assert 6 <= int(seen.sum()) <= 12
         assert not bool((seen & ~rendering.visible).any())

@@ -14,7 +14,7 @@ from torch import Tensor
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, to measure and test it."""
-_INTERFACE_VERSION = 16
+_INTERFACE_VERSION = 17
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -42,13 +42,23 @@ class CView(ctypes.Structure):
     )
 
 
+class CHarmonics(ctypes.Structure):
+    """Pointers to the coefficients of rows that follow each other, and to their gradients."""
+
+    _fields_ = (
+        *((name, c_int64) for name in ("rows", "terms", "stored_rest", "first_stride", "rest_stride")),
+        *((name, c_void_p) for name in ("first", "rest", "v_first", "v_rest")),
+    )
+
+
 class CRows(ctypes.Structure):
     """Pointers to the Gaussians' fields."""
 
     _fields_ = (
         ("count", c_int64),
-        ("terms", c_int64),
-        *((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "sh", "displacements", "gates")),
+        ("tables", c_int64),
+        ("harmonics", ctypes.POINTER(CHarmonics)),
+        *((name, c_void_p) for name in ("means", "quaternions", "scales", "opacities", "displacements", "gates")),
     )
 
 
@@ -67,9 +77,9 @@ class CRawRows(ctypes.Structure):
     """Pointers to rows as a node stores them; multipliers and instances may be null."""
 
     _fields_ = (
-        *((name, c_int64) for name in ("count", "stored_rest", "terms", "stride")),
+        ("count", c_int64),
         ("logit_limit", c_double),
-        *((name, c_void_p) for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")),
+        *((name, c_void_p) for name in ("means", "log_scales", "quaternions", "opacity_logits")),
         *((name, c_void_p) for name in ("multipliers", "instances")),
         ("num_instances", c_int64),
         *((name, c_void_p) for name in ("pose_quaternions", "pose_translations", "present")),

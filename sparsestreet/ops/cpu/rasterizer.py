@@ -1,5 +1,6 @@
 """The C++ backend as an autograd function over torch tensors."""
 
+from collections.abc import Sequence
 from ctypes import Array, byref, c_double, c_void_p
 
 import torch
@@ -11,7 +12,7 @@ from sparsestreet.geometry.cameras import exact_position
 from sparsestreet.geometry.lenses import fold_radius_squared
 from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT, Lease
-from sparsestreet.ops.raster import COUNTINGS, LeaveOneOutSums, PairLimitError, Raster
+from sparsestreet.ops.raster import COUNTINGS, SHAPE, LeaveOneOutSums, PairLimitError, Raster, empty_gradients
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype, check_values
 from sparsestreet.phases import phase
@@ -42,10 +43,9 @@ def rasterize(
     is slow, and gives the same layers and infinite radii.
     """
     check_dtype(gaussians, "backend 'cpu'")
-    g = gaussians
-    fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
-    view = _view(camera, settings, every_tile)
-    return Raster(*_Blend.apply(*fields, screen_offsets, gates, _moved(g), view, variant, changes))
+    view, terms = _view(camera, settings, every_tile), gaussians.terms
+    given = (screen_offsets, gates, _moved(gaussians), view, variant, changes, terms)
+    return Raster(*_Blend.apply(*given, *gaussians.learned()))
 
 
 def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> Contribution:
@@ -76,30 +76,27 @@ def _measure(
 ) -> None:
     """Call a function of the library that writes what it measures of each row to where ``structs`` point."""
     check_dtype(gaussians, "backend 'cpu'")
-    g = gaussians
-    fields = tuple(field.detach().contiguous() for field in (g.means, g.quaternions, g.scales, g.opacities, g.sh))
-    displacements = _moved(g)
-    lease, report = Lease(g.means.dtype, FASTEST_VARIANT), native.CReport()
+    fields = tuple(field.detach().contiguous() for field in gaussians.learned())
+    displacements = _moved(gaussians)
+    lease, report = Lease(gaussians.means.dtype, FASTEST_VARIANT), native.CReport()
     status = getattr(native.load_library(), function)(
         lease.workspace.handle,
         byref(_view(camera, settings)),
-        byref(_rows(fields, displacements)),
+        byref(_rows(fields, gaussians.terms, displacements)),
         *map(byref, structs),
         byref(report),
     )
-    _raise_for(status, fields, displacements, report)
+    _raise_for(status, fields, gaussians.terms, displacements, report)
 
 
 class _Blend(torch.autograd.Function):
-    """Maps five fields, the screen offsets and the gates to the layers of a Raster."""
+    """Maps four fields, the tables of harmonics, the screen offsets and the gates to the layers of a Raster."""
 
     @staticmethod
-    def forward(
-        ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, displacements, view, variant, changes
-    ):  # fmt: skip
+    def forward(ctx, screen_offsets, gates, displacements, view, variant, changes, terms, *fields):
         ctx.set_materialize_grads(False)
-        fields = tuple(field.contiguous() for field in (means, quaternions, scales, opacities, sh))
-        gates = None if gates is None else gates.contiguous()
+        fields = tuple(field.contiguous() for field in fields)
+        means, gates = fields[0], None if gates is None else gates.contiguous()
         rgb = means.new_empty(view.height, view.width, 3)
         transmittance, depth_sum = means.new_empty(2, view.height, view.width)
         radii = means.new_empty(means.shape[0])
@@ -107,15 +104,15 @@ class _Blend(torch.autograd.Function):
         status = native.load_library().splat_forward(
             lease.workspace.handle,
             byref(view),
-            byref(_rows(fields, displacements, gates)),
+            byref(_rows(fields, terms, displacements, gates)),
             byref(native.pointers(rgb, transmittance, depth_sum)),
             radii.data_ptr(),
             byref(report),
         )
-        _raise_for(status, fields, displacements, report)
+        _raise_for(status, fields, terms, displacements, report)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*fields, gates, displacements, transmittance, None if changes is None else rgb)
-        ctx.view, ctx.lease, ctx.changes = view, lease, changes
+        ctx.view, ctx.lease, ctx.changes, ctx.terms = view, lease, changes, terms
         return rgb, transmittance, depth_sum, radii
 
     @staticmethod
@@ -123,22 +120,22 @@ class _Blend(torch.autograd.Function):
     def backward(ctx, v_rgb, v_transmittance, v_depth_sum, _v_radii):
         *fields, gates, displacements, transmittance, rgb = ctx.saved_tensors
         cotangents = [None if v is None else v.contiguous() for v in (v_rgb, v_transmittance, v_depth_sum)]
-        gradients = [torch.empty_like(field) for field in fields]
+        gradients = empty_gradients(fields, ctx.terms, ctx.needs_input_grad[-len(fields) :])
         screen = fields[0].new_empty(fields[0].shape[0], 2)
         of_gates = None if gates is None else torch.empty_like(gates)
         with phase("splat backward"):
             status = native.load_library().splat_backward(
                 ctx.lease.workspace.handle,
                 byref(ctx.view),
-                byref(_rows(fields, displacements, gates)),
+                byref(_rows(fields, ctx.terms, displacements, gates, gradients[SHAPE:])),
                 transmittance.data_ptr(),
                 byref(native.pointers(*cotangents)),
-                byref(native.pointers(*gradients, screen, of_gates)),
+                byref(native.pointers(*gradients[:SHAPE], screen, of_gates)),
             )
-        _raise_for(status, fields, displacements, native.CReport())
+        _raise_for(status, fields, ctx.terms, displacements, native.CReport())
         if ctx.changes is not None:
             ctx.changes.found = _gathered(ctx.lease, ctx.view, ctx.changes, len(screen), rgb, transmittance)
-        return *gradients, screen, of_gates, None, None, None, None
+        return screen, of_gates, None, None, None, None, None, *gradients
 
 
 def _gathered(
@@ -209,19 +206,46 @@ def _view(camera: Camera, settings: SplatSettings, every_tile: bool = False) -> 
 
 
 def _rows(
-    fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None, gates: Tensor | None = None
+    fields: Sequence[Tensor],
+    terms: int | None,
+    displacements: Tensor | None,
+    gates: Tensor | None = None,
+    gradients: Sequence[Tensor | None] | None = None,
 ) -> native.CRows:
-    return native.CRows(fields[0].shape[0], fields[4].shape[1], *native.pointers(*fields, displacements, gates))
+    """``gradients``: those of the tables of harmonics; None where they are not asked for."""
+    tables = fields[SHAPE:]
+    parts = _harmonics(tables, terms, [None] * len(tables) if gradients is None else gradients)
+    shape = native.pointers(*fields[:SHAPE], displacements, gates)
+    return native.CRows(fields[0].shape[0], len(parts), parts, *shape)
+
+
+def _harmonics(
+    tables: Sequence[Tensor], terms: int | None, gradients: Sequence[Tensor | None]
+) -> Array[native.CHarmonics]:
+    if terms is None:
+        (sh,), (v_sh,) = tables, gradients
+        stored, v_rest = sh.shape[1], None if v_sh is None else v_sh[:, 1:]
+        pointers = native.pointers(sh, sh[:, 1:], v_sh, v_rest)
+        return (native.CHarmonics * 1)((len(sh), stored, stored - 1, 3 * stored, 3 * stored, *pointers))
+    half = len(tables) // 2
+    parts = []
+    for first, rest, *of_both in zip(tables[:half], tables[half:], gradients[:half], gradients[half:], strict=True):
+        stored, pointers = rest.shape[1], native.pointers(first, rest, *of_both)
+        parts.append((len(first), min(1 + stored, terms), stored, 3, 3 * stored, *pointers))
+    return (native.CHarmonics * half)(*parts)
 
 
 def _raise_for(
-    status: int, fields: tuple[Tensor, ...] | list[Tensor], displacements: Tensor | None, report: native.CReport
+    status: int,
+    fields: Sequence[Tensor],
+    terms: int | None,
+    displacements: Tensor | None,
+    report: native.CReport,
 ) -> None:
     if status == native.STATUS_OK:
         return
     if status == native.STATUS_BAD_VALUE:
-        means, quaternions, scales, opacities, sh = fields
-        check_values(Gaussians(means, quaternions, scales, opacities, sh, displacements))
+        check_values(Gaussians.of_learned(fields, terms, displacements))
     if status == native.STATUS_TOO_MANY_PAIRS:
         worst = [(row, pairs) for row, pairs in zip(report.worst_rows, report.worst_pairs, strict=True) if row >= 0]
         raise PairLimitError.of(report.pairs, PAIR_LIMIT, worst)

@@ -13,30 +13,27 @@ from sparsestreet.ops.cpu import library as native
 from sparsestreet.ops.cpu.library import FASTEST_VARIANT
 from sparsestreet.ops.raw import LEARNED, OPACITY_LOGIT_LIMIT, Inputs, RawGaussians, split_parts
 from sparsestreet.phases import phase
-from sparsestreet.types import Gaussians
 
 
-def activate(parts: Sequence[RawGaussians], sh_degree: int, variant: int = FASTEST_VARIANT) -> Gaussians:
-    """``sparsestreet.ops.activate`` in C++, bitwise the same for any number of threads."""
-    terms = [part.terms(sh_degree) for part in parts]
-    tensors = [tensor for part in parts for tensor in part.tensors()]
-    return Gaussians(*_Activate.apply(terms, variant, *tensors))
+def activate(parts: Sequence[RawGaussians], variant: int = FASTEST_VARIANT) -> Sequence[Tensor]:
+    """Means, quaternions, scales and opacities of ``sparsestreet.ops.activate`` in C++, bitwise the same for any number
+    of threads."""
+    return _Activate.apply(variant, *(tensor for part in parts for tensor in part.tensors()))
 
 
 class _Activate(torch.autograd.Function):
-    """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities, coefficients."""
+    """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales and opacities."""
 
     @staticmethod
-    def forward(ctx, terms, variant, *given):
+    def forward(ctx, variant, *given):
         tensors = [None if tensor is None else tensor.contiguous() for tensor in given]
         ctx.save_for_backward(*tensors)
-        ctx.terms, ctx.kind = terms, (given[0].dtype == torch.float64, variant)
+        ctx.kind = (given[0].dtype == torch.float64, variant)
         parts = split_parts(tensors)
-        count, stride = parts[-1][0].stop, max(terms)
-        outputs = [given[0].new_empty(count, *width) for width in ((3,), (4,), (3,), (), (stride, 3))]
-        for (rows, part), used in zip(parts, terms, strict=True):
+        outputs = [given[0].new_empty(parts[-1][0].stop, *width) for width in ((3,), (4,), (3,), ())]
+        for rows, part in parts:
             active = native.pointers(*(output[rows] for output in outputs))
-            _raise_for(native.load_library().splat_activate(*ctx.kind, byref(_rows(part, used, stride)), byref(active)))
+            _raise_for(native.load_library().splat_activate(*ctx.kind, byref(_rows(part)), byref(active)))
         return tuple(outputs)
 
     @staticmethod
@@ -45,35 +42,29 @@ class _Activate(torch.autograd.Function):
         gradients = []
         with phase("scene backward"):
             cotangents = [value.contiguous() for value in cotangents]
-            for (rows, part), used in zip(split_parts(ctx.saved_tensors), ctx.terms, strict=True):
-                rests = not ctx.needs_input_grad[2 + len(gradients) + 5]
-                gradients += _part_backward(ctx, part, used, [value[rows] for value in cotangents], rests)
-        return None, None, *gradients
+            for rows, part in split_parts(ctx.saved_tensors):
+                gradients += _part_backward(ctx, part, [value[rows] for value in cotangents])
+        return None, *gradients
 
 
-def _part_backward(ctx, part: Inputs, terms: int, cotangents: list[Tensor], rests: bool) -> list[Tensor | None]:
-    """Gradients of a part's inputs from those of its rows; none of the coefficients after the first where they rest."""
-    wanted = [None if rests and place == 5 else tensor for place, tensor in enumerate(part[:LEARNED])]
-    gradients: list[Tensor | None] = [None if tensor is None else torch.empty_like(tensor) for tensor in wanted]
+def _part_backward(ctx, part: Inputs, cotangents: list[Tensor]) -> list[Tensor | None]:
+    """Gradients of a part's inputs from those of its rows."""
+    gradients: list[Tensor | None] = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:LEARNED]]
     placed = part[LEARNED] is not None
     if not placed:
         # Means and quaternions passed through unchanged.
         gradients[0] = gradients[2] = None
-    # As in torch, so that an optimizer skips coefficients that are not in use yet.
-    if terms == 1:
-        gradients[5] = None
     active, raw = native.pointers(*cotangents), native.pointers(*gradients)
-    rows = _rows(part, terms, max(ctx.terms))
-    _raise_for(native.load_library().splat_activate_backward(*ctx.kind, byref(rows), byref(active), byref(raw)))
+    _raise_for(native.load_library().splat_activate_backward(*ctx.kind, byref(_rows(part)), byref(active), byref(raw)))
     if not placed:
         gradients[0], gradients[2] = cotangents[:2]
     return [*gradients, None, None]
 
 
-def _rows(part: Inputs, terms: int, stride: int) -> native.CRawRows:
+def _rows(part: Inputs) -> native.CRawRows:
     *fields, multipliers, turns, shifts, instances, present = part
     return native.CRawRows(
-        fields[0].shape[0], fields[-1].shape[1], terms, stride, OPACITY_LOGIT_LIMIT,
+        fields[0].shape[0], OPACITY_LOGIT_LIMIT,
         *native.pointers(*fields, multipliers, instances), 0 if turns is None else turns.shape[0],
         *native.pointers(turns, shifts, present), native.thread_count(),
     )  # fmt: skip

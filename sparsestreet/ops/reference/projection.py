@@ -239,7 +239,7 @@ def on_screen(gaussians: Gaussians, rows: Int[Tensor, " v"], camera: Camera, set
         ratio, floor = bare / determinant, COMPENSATION_FLOOR**2
         opacities = opacities * torch.where(ratio > floor, ratio, floor).sqrt()
     seen_from = in_camera.detach() if settings.detach_directions else in_camera
-    colors = view_colors(gaussians.sh[rows], seen_from @ _rotation(camera, in_camera), settings.clamp_colors)
+    colors = view_colors(gaussians.dense_sh()[rows], seen_from @ _rotation(camera, in_camera), settings.clamp_colors)
     if settings.half_colors:
         colors = _rounded_to_half(colors)
     reaches = _reaches(opacities.detach(), settings)

@@ -1,9 +1,8 @@
 """Activation and placement of stored rows, and their gradients, one kernel each per part:
 ``sparsestreet.ops.activate``.
 
-A lane is a row. Coefficients are copied in tiles of rows and columns, so that neighboring lanes access neighbors.
-Gradients of poses are sums over rows. Each program adds up its rows by instance, and torch adds the programs. Without
-atomics two runs agree to the last bit.
+A lane is a row. Gradients of poses are sums over rows. Each program adds up its rows by instance, and torch adds the
+programs. Without atomics two runs agree to the last bit.
 """
 
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from torch.autograd.function import once_differentiable
 from triton.runtime.jit import KernelInterface
 
 from sparsestreet.ops.raw import OPACITY_LOGIT_LIMIT, Inputs, RawGaussians, split_parts
-from sparsestreet.ops.triton.launch import constant, jit, launch
+from sparsestreet.ops.triton.launch import jit, launch
 from sparsestreet.ops.triton.quaternions import (
     conjugate,
     load_row,
@@ -32,31 +31,25 @@ from sparsestreet.ops.triton.quaternions import (
     unit_quaternion,
     weighted,
 )
-from sparsestreet.types import Gaussians
 
 LANES = 128
-COLUMNS = constant(16)
-"""How many numbers of a row are copied at once."""
 
 
-def activate(parts: Sequence[RawGaussians], sh_degree: int) -> Gaussians:
-    """``sparsestreet.ops.activate`` of contiguous float32 tensors."""
-    terms = max(part.terms(sh_degree) for part in parts)
-    tensors = [tensor for part in parts for tensor in part.tensors()]
-    return Gaussians(*_Activate.apply(terms, *tensors))
+def activate(parts: Sequence[RawGaussians]) -> Sequence[Tensor]:
+    """Means, quaternions, scales and opacities of ``sparsestreet.ops.activate`` of contiguous float32 tensors."""
+    return _Activate.apply(*(tensor for part in parts for tensor in part.tensors()))
 
 
 class _Activate(torch.autograd.Function):
-    """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales, opacities, coefficients."""
+    """Maps stored rows, multipliers and poses of all parts to means, quaternions, scales and opacities."""
 
     @staticmethod
-    def forward(ctx, terms, *tensors):
-        ctx.terms = terms
+    def forward(ctx, *tensors):
         ctx.save_for_backward(*tensors)
         parts = split_parts(tensors)
-        outputs = [tensors[0].new_empty(parts[-1][0].stop, *width) for width in ((3,), (4,), (3,), (), (terms, 3))]
+        outputs = [tensors[0].new_empty(parts[-1][0].stop, *width) for width in ((3,), (4,), (3,), ())]
         for rows, part in parts:
-            _launch(activate_rows, terms, rows, part, *outputs)
+            _launch(activate_rows, rows, part, *outputs)
         return tuple(outputs)
 
     @staticmethod
@@ -65,25 +58,22 @@ class _Activate(torch.autograd.Function):
         cotangents = [value.contiguous() for value in cotangents]
         gradients = []
         for rows, part in split_parts(ctx.saved_tensors):
-            gradients += _part_backward(ctx.terms, rows, part, cotangents)
-        return None, *gradients
+            gradients += _part_backward(rows, part, cotangents)
+        return tuple(gradients)
 
 
-def _part_backward(terms: int, rows: slice, part: Inputs, cotangents: list[Tensor]) -> list[Tensor | None]:
+def _part_backward(rows: slice, part: Inputs, cotangents: list[Tensor]) -> list[Tensor | None]:
     """Gradients of a part's inputs from those of all rows."""
-    means, turns = part[0], part[7]
-    gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:7]]
+    means, turns = part[0], part[5]
+    gradients = [None if tensor is None else torch.empty_like(tensor) for tensor in part[:5]]
     if turns is None:
         # Means and quaternions passed through unchanged.
         gradients[0] = gradients[2] = None
-    # As in torch, so that an optimizer skips coefficients that are not in use yet.
-    if min(terms, 1 + part[5].shape[1]) == 1:
-        gradients[5] = None
     # One line per program: four numbers of each instance's quaternion, then three of each translation.
     count = 0 if turns is None else len(turns)
     sums = means if turns is None else means.new_zeros(-(-len(means) // LANES), 7 * count)
     written = [means if value is None else value for value in gradients]
-    _launch(activate_rows_backward, terms, rows, part, *cotangents, *written, sums, count)
+    _launch(activate_rows_backward, rows, part, *cotangents, *written, sums, count)
     if turns is None:
         gradients[0], gradients[2] = cotangents[0][rows], cotangents[1][rows]
         return [*gradients, None, None, None, None]
@@ -91,7 +81,7 @@ def _part_backward(terms: int, rows: slice, part: Inputs, cotangents: list[Tenso
     return [*gradients, v_turns.view(-1, 4), v_shifts.view(-1, 3), None, None]
 
 
-def _launch(kernel: KernelInterface, terms: int, rows: slice, part: Inputs, *others: Tensor | int) -> None:
+def _launch(kernel: KernelInterface, rows: slice, part: Inputs, *others: Tensor | int) -> None:
     *floats, instances, present = part
     means, placed = floats[0], present is not None
     # Means replace arguments that are not read: multipliers without a mask, and poses without a placement.
@@ -99,7 +89,7 @@ def _launch(kernel: KernelInterface, terms: int, rows: slice, part: Inputs, *oth
     indices = (instances.contiguous(), present.contiguous().view(torch.uint8)) if placed else (means, means)
     launch(
         kernel, len(means), LANES, *floats, *indices, *others, rows.start, len(means), OPACITY_LOGIT_LIMIT,
-        TERMS=terms, STORED=1 + floats[5].shape[1], MASKED=part[6] is not None, PLACED=placed,
+        MASKED=part[4] is not None, PLACED=placed,
     )  # fmt: skip
 
 
@@ -110,23 +100,13 @@ def opacity_of(logit, limit):
     return 1 / (1 + tl.exp(-tl.where(below < -limit, -limit, below)))
 
 
-@jit
-def tile(row, given, COLUMN: tl.constexpr):
-    """Rows and columns from COLUMN, and which of them exist, for the first coefficient and for the others."""
-    column = COLUMN + tl.arange(0, COLUMNS)[None, :]
-    return row[:, None], column, given[:, None] & (column < 3), given[:, None] & (column >= 3)
-
-
 @partial(jit, do_not_specialize=["start", "rows"])
 def activate_rows(
-    means, log_scales, quaternions, logits, dc, rest, multipliers, turns, shifts, instances, present,
-    out_means, out_quaternions, scales, opacities, sh, start, rows, limit,
-    TERMS: tl.constexpr, STORED: tl.constexpr, MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
+    means, log_scales, quaternions, logits, multipliers, turns, shifts, instances, present,
+    out_means, out_quaternions, scales, opacities, start, rows, limit,
+    MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``turns``, ``shifts``: quaternions and translations of the instances; ``start``: the first row to write.
-
-    TERMS, STORED: how many coefficients of a row are written, and stored; those not stored are 0.
-    """
+    """``turns``, ``shifts``: quaternions and translations of the instances; ``start``: the first row to write."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     given, to = row < rows, start + row
     mean, q = load_row(means, row, given, 3), load_row(quaternions, row, given, 4)
@@ -147,22 +127,14 @@ def activate_rows(
     store_row(out_quaternions, to, q, given, 4)
     store_row(scales, to, size, given, 3)
     tl.store(opacities + to, opacity, given)
-    for first in tl.static_range(0, 3 * TERMS, COLUMNS):
-        of, column, begins, follows = tile(row, given, first)
-        value = tl.where(
-            column < 3,
-            tl.load(dc + of * 3 + column, begins, 0.0),
-            tl.load(rest + of * (3 * STORED - 3) + column - 3, follows & (column < 3 * STORED), 0.0),
-        )
-        tl.store(sh + (start + of) * (3 * TERMS) + column, value, given[:, None] & (column < 3 * TERMS))
 
 
 @partial(jit, do_not_specialize=["count", "start", "rows"])
 def activate_rows_backward(
-    means, log_scales, quaternions, logits, dc, rest, multipliers, turns, shifts, instances, present,
-    v_out_means, v_out_quaternions, v_scales, v_opacities, v_sh,
-    v_means, v_log_scales, v_quaternions, v_logits, v_dc, v_rest, v_multipliers, sums, count, start, rows, limit,
-    TERMS: tl.constexpr, STORED: tl.constexpr, MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
+    means, log_scales, quaternions, logits, multipliers, turns, shifts, instances, present,
+    v_out_means, v_out_quaternions, v_scales, v_opacities,
+    v_means, v_log_scales, v_quaternions, v_logits, v_multipliers, sums, count, start, rows, limit,
+    MASKED: tl.constexpr, PLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write gradients; of means, quaternions and poses (``sums`` [programs, 7 count], 0 before) only if PLACED."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
@@ -196,9 +168,3 @@ def activate_rows_backward(
     tl.store(v_logits + row, tl.where(held, 0.0, v_opacity * multiplier * opacity * (1 - opacity)), given)
     if MASKED:
         tl.store(v_multipliers + row, v_opacity * opacity + along[0] + along[1] + along[2], given)
-    for first in tl.static_range(0, 3 * STORED if TERMS > 1 else 3, COLUMNS):
-        of, column, begins, follows = tile(row, given, first)
-        v = tl.load(v_sh + (start + of) * (3 * TERMS) + column, given[:, None] & (column < 3 * TERMS), 0.0)
-        tl.store(v_dc + of * 3 + column, v, begins)
-        if TERMS > 1:
-            tl.store(v_rest + of * (3 * STORED - 3) + column - 3, v, follows & (column < 3 * STORED))

@@ -36,12 +36,22 @@ from sparsestreet.ops.triton.project import (
     axes_backward,
     blurred,
     camera_axes,
+    coefficients_of,
     color_backward,
     compensation,
     conic_backward,
 )
 from sparsestreet.ops.triton.quaternions import load_row, plus, store_row, times, transposed_times, unit_quaternion
-from sparsestreet.ops.triton.view import ROTATION, TILE, KernelView, in_camera, load_columns, load_matrix, store_columns
+from sparsestreet.ops.triton.view import (
+    ROTATION,
+    TILE,
+    KernelView,
+    in_camera,
+    load_columns,
+    load_matrix,
+    store_columns,
+    store_harmonics,
+)
 
 SLOT_LENGTH, GATED_SLOT_LENGTH = 12, 16
 SLOT, GATED_SLOT = constant(SLOT_LENGTH), constant(GATED_SLOT_LENGTH)
@@ -319,30 +329,37 @@ def screen_gradient(s, to, mask):
     return v_mean, v_absolute, (k * s[3], k * s[4], k * s[5]), s[0] * tl.exp2(-log2_opacity)
 
 
-@partial(jit, do_not_specialize=["rows"])
+@partial(jit, do_not_specialize=["start", "end"])
 def project_rows_backward(
-    means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, sums,
-    v_means, v_quaternions, v_scales, v_opacities, v_sh, v_screen, rows,
-    SUMS: tl.constexpr, TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, DETACHED: tl.constexpr,
-    PLAIN: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, COLUMNS: tl.constexpr,
-    DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
+    means, quaternions, scales, opacities, first, rest, displacements, view, records, tile_counts, sums,
+    v_means, v_quaternions, v_scales, v_opacities, v_first, v_rest, v_screen, start, end,
+    SUMS: tl.constexpr, TERMS: tl.constexpr, STORED: tl.constexpr, REST: tl.constexpr, ANTIALIAS: tl.constexpr,
+    CLAMPED: tl.constexpr, DETACHED: tl.constexpr, PLAIN: tl.constexpr, DISTORTED: tl.constexpr,
+    ROLLING: tl.constexpr, COLUMNS: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of all rows; exactly 0 for rows that were not drawn, of which only the tile count is read.
+    """Gradients of the rows from ``start`` to ``end``, of one table of harmonics; exactly 0 for rows that were not
+    drawn, of which only the tile count is read.
 
-    SUMS: how many numbers a row has in ``sums``, of which the first twelve are read."""
+    SUMS: how many numbers a row has in ``sums``, of which the first twelve are read. REST: whether coefficients behind
+    the first have gradients."""
     row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    given = row < rows
+    if STORED >= 0:
+        row += start
+    given = row < end
     seen = given & (tl.load(tile_counts + row, given, 0) > 0)
     rotation = load_matrix(view + ROTATION)
     mean = in_camera(view, rotation, load_row(means, row, seen, 3))
     # Lanes of rows that were not drawn compute with a harmless row.
     mean = (tl.where(seen, mean[0], 0.0), tl.where(seen, mean[1], 0.0), tl.where(seen, mean[2], 1.0))
     s = load_columns(sums, row, seen, SUMS)
-    coefficients = load_columns(sh, row, seen, 3 * TERMS)
+    coefficients = coefficients_of(first, rest, row, start, seen, TERMS, STORED)
     # This comes first, so that nothing else holds registers meanwhile.
     v_colors = (s[8], s[9], s[10])
     v_coefficients, v_mean = color_backward(rotation, mean, v_colors, coefficients, TERMS, CLAMPED, DETACHED)
-    store_columns(v_sh, row, v_coefficients, given, 3 * TERMS)
+    if STORED >= 0:
+        store_harmonics(v_first, v_rest, row - start, v_coefficients, given, TERMS, STORED, REST)
+    else:
+        store_columns(v_first, row, v_coefficients, given, 3 * TERMS)
 
     size = load_row(scales, row, seen, 3)
     unit, inverse_length = unit_quaternion(load_columns(quaternions, row, seen, 4))

@@ -35,6 +35,7 @@ from sparsestreet.ops.triton.view import (
     count_tiles,
     in_camera,
     load_columns,
+    load_harmonics,
     load_matrix,
     store_columns,
 )
@@ -303,9 +304,19 @@ def half_box(view, effective, variance_x, variance_y, BOUNDED: tl.constexpr):
 
 
 @jit
-def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, CLAMPED: tl.constexpr, HALF_COLORS: tl.constexpr):
-    """Colors of the rows that are seen, and which of these have finite coefficients; other rows are not read."""
-    coefficients, color = load_columns(sh, row, seen, 3 * TERMS), ()
+def coefficients_of(first, rest, row, start, seen, TERMS: tl.constexpr, STORED: tl.constexpr):
+    """The harmonics of rows, of one table of all rows, or (STORED >= 0) of tables whose first row is ``start``."""
+    if STORED >= 0:
+        coefficients = load_harmonics(first, rest, row - start, seen, TERMS, STORED)
+    else:
+        coefficients = load_columns(first, row, seen, 3 * TERMS)
+    return coefficients
+
+
+@jit
+def seen_color(coefficients, direction, TERMS: tl.constexpr, CLAMPED: tl.constexpr, HALF_COLORS: tl.constexpr):
+    """Colors of rows, and which of these have finite coefficients."""
+    color = ()
     raw = raw_color(basis(direction, TERMS), coefficients, TERMS)
     for i in tl.static_range(3):
         # As in torch.where(color > 0, color, 0).
@@ -318,20 +329,21 @@ def seen_color(sh, row, seen, direction, TERMS: tl.constexpr, CLAMPED: tl.conste
     return color, all_finite(coefficients, 3 * TERMS)
 
 
-@partial(jit, do_not_specialize=["rows"])
+@partial(jit, do_not_specialize=["start", "end", "blocks"])
 def project_rows(
-    means, quaternions, scales, opacities, sh, displacements, view, records, tile_counts, radii, numbers, rows,
-    TERMS: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr, HALF_COLORS: tl.constexpr,
-    BOUNDED: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr, COLUMNS: tl.constexpr,
-    DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
+    means, quaternions, scales, opacities, first, rest, displacements, view, records, tile_counts, radii, numbers,
+    start, end, blocks, TERMS: tl.constexpr, STORED: tl.constexpr, ANTIALIAS: tl.constexpr, CLAMPED: tl.constexpr,
+    HALF_COLORS: tl.constexpr, BOUNDED: tl.constexpr, DISTORTED: tl.constexpr, ROLLING: tl.constexpr,
+    COLUMNS: tl.constexpr, DISPLACED: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Write the record of each visible row, and for all rows the number of tiles (0: culled) and the radius.
 
-    ``numbers`` [3 programs]: each program's count of pairs, then of rows with tiles, then of bad rows. Comparisons are
-    written so that NaN culls.
+    Rows are those from ``start`` to ``end`` of one table of harmonics. ``numbers`` [3 blocks of all rows]: each block's
+    count of pairs, then of rows with tiles, then of bad rows. Comparisons are written so that NaN culls.
     """
-    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    given = row < rows
+    block = tl.program_id(0) + start // BLOCK
+    row = block.to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    given = (row >= start) & (row < end)
     opacity, mean, q, size, moved, alive, wrong = checked_row(
         means, quaternions, scales, opacities, displacements, row, given, DISPLACED
     )
@@ -362,7 +374,8 @@ def project_rows(
     tiles = count_tiles(x, y, l11, l21, l22, reach, seen, width, height, BOUNDED)
     tl.store(tile_counts + row, tiles, given)
 
-    color, good = seen_color(sh, row, seen, direction_of(rotation, mean)[0], TERMS, CLAMPED, HALF_COLORS)
+    coefficients = coefficients_of(first, rest, row, start, seen, TERMS, STORED)
+    color, good = seen_color(coefficients, direction_of(rotation, mean)[0], TERMS, CLAMPED, HALF_COLORS)
     # In the order of records.py.
     values = (x, y, l11, l21, l22, log2_opacity, cutoff, color[0], color[1], color[2], mean[2], 0 * x)
     store_columns(records, row, values, seen & (tiles > 0), record.RECORD)
@@ -370,4 +383,8 @@ def project_rows(
     bad = tl.sum((wrong | (good == 0)).to(tl.int32))
     place = tl.arange(0, 4)
     number = tl.where(place == 0, pairs, tl.where(place == 1, drawn, bad))
-    tl.store(numbers + place * tl.num_programs(0) + tl.program_id(0), number.to(tl.int64), place < 3)
+    number, to = number.to(tl.int64), numbers + place * blocks + block
+    if STORED >= 0:
+        # The launch before this one has counted the rows of the block that are not its own.
+        number += tl.load(to, (place < 3) & (block * BLOCK < start), 0)
+    tl.store(to, number, place < 3)

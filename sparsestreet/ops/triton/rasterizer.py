@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sparsestreet.ops.raster import LeaveOneOutSums
+from sparsestreet.ops.raster import SHAPE, LeaveOneOutSums, empty_gradients
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.triton import blend
 from sparsestreet.ops.triton.blend import MAX_ROWS
@@ -34,7 +34,7 @@ from sparsestreet.ops.triton.pixels import (
     differentiate_view,
     pixel_arguments,
 )
-from sparsestreet.ops.triton.screen import Screen, contiguous, draw, effects, fields_of, given_or, project
+from sparsestreet.ops.triton.screen import Screen, contiguous, draw, effects, fields_of, given_or, parts_of, project
 from sparsestreet.ops.triton.view import KernelView
 from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
 
@@ -49,13 +49,13 @@ def render(
     changes: LeaveOneOutSums | None = None,
 ) -> Rendering:
     """Projects, sorts by tile, blends and composes, in float32. Bitwise the same in every run on one device."""
-    g = gaussians
-    _check(g)
-    fields = (g.means, g.quaternions, g.scales, g.opacities, g.sh)
+    _check(gaussians)
+    fields = gaussians.learned()
     learned = fields if gates is None else (*fields, gates)
     differentiated = torch.is_grad_enabled() and any(field.requires_grad for field in (*learned, screen_offsets))
-    view = KernelView.of(camera, settings)
-    images = _Blend.apply(*fields, screen_offsets, gates, background, g.displacements, view, differentiated, changes)
+    view, moved = KernelView.of(camera, settings), gaussians.displacements
+    given = (screen_offsets, gates, background, moved, view, differentiated, changes, gaussians.terms)
+    images = _Blend.apply(*given, *fields)
     return Rendering(*images, screen_offsets)
 
 
@@ -118,23 +118,27 @@ def _remove(
     return LeaveOneOut(largest, totals[:, 2:], totals[:, 1])
 
 
+_GIVEN = 8
+"""Number of the arguments before the fields."""
+
+
 class _Blend(torch.autograd.Function):
-    """Maps five fields, the screen offsets, gates and the background to the images of a Rendering, and the radii."""
+    """Maps four fields, the tables of harmonics, the screen offsets, gates and the background to the images of a
+    Rendering, and the radii."""
 
     @staticmethod
     def forward(
-        ctx, means, quaternions, scales, opacities, sh, screen_offsets, gates, background, displacements, view,
-        differentiated, changes,
+        ctx, screen_offsets, gates, background, displacements, view, differentiated, changes, terms, *fields
     ):  # fmt: skip
         ctx.set_materialize_grads(False)
-        gaussians = Gaussians(means, quaternions, scales, opacities, sh, displacements)
+        gaussians = Gaussians.of_learned(fields, terms, displacements)
         background = contiguous(background)
         screen, drawn = draw(
             gaussians, view, lambda screen: blend_view(screen, view, differentiated, background), gates
         )  # fmt: skip
         ctx.mark_non_differentiable(screen.radii)
         ctx.save_for_backward(*fields_of(gaussians), drawn.ends.transmittance, drawn.depth, background)
-        ctx.screen, ctx.view, ctx.displacements = screen, view, contiguous(displacements)
+        ctx.screen, ctx.view, ctx.displacements, ctx.terms = screen, view, contiguous(displacements), terms
         ctx.lasts, ctx.parts, ctx.changes = drawn.ends.lasts, drawn.ends.parts, changes
         return drawn.rgb, drawn.alpha, drawn.depth, screen.radii
 
@@ -145,29 +149,32 @@ class _Blend(torch.autograd.Function):
         screen, view, lists = ctx.screen, ctx.view, ctx.screen.lists
         v_rgb = transmittance.new_zeros(*transmittance.shape, 3) if v_rgb is None else v_rgb.contiguous()
         v_passed, v_depth_sum, v_background = decompose(
-            transmittance, depth, background, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[7]
+            transmittance, depth, background, v_rgb, contiguous(v_alpha), contiguous(v_depth), ctx.needs_input_grad[2]
         )
-        if not any(ctx.needs_input_grad[:7]):
-            return *[None] * 7, v_background, None, None, None, None
+        asked = ctx.needs_input_grad[_GIVEN:]
+        if not any((*ctx.needs_input_grad[:2], *asked)):
+            return None, None, v_background, *[None] * (_GIVEN - 3 + len(asked))
         ends, plain = Ends(transmittance, ctx.lasts, ctx.parts), view.settings.plain_gradients
         if (changes := ctx.changes) is not None:
             # A loop of its own over the same lists: in the one below it would take the registers of gradients.
             changes.found = _remove(screen, view, ends, len(fields[0]), changes.background, changes.pixel_weights)
-        absolute = ctx.needs_input_grad[5] and not plain
+        absolute = ctx.needs_input_grad[0] and not plain
         gradients = differentiate_view(screen, view, ends, v_rgb, v_passed, v_depth_sum, absolute)
         sums = transmittance.new_empty(len(fields[0]), gradients.shape[1])
         _sum_slots(gradients, lists, sums, 16, tl.float32)
-        outputs = [torch.empty_like(field) for field in fields]
-        v_screen = transmittance.new_empty(len(fields[0]), 2)
-        launch(
-            project_rows_backward, len(fields[0]), block_of(view),
-            *fields, given_or(ctx.displacements, fields[0]), screen.table, screen.records, screen.tile_counts, sums,
-            *outputs, v_screen, len(fields[0]),
-            SUMS=sums.shape[1], TERMS=fields[4].shape[1], ANTIALIAS=view.settings.antialias,
-            CLAMPED=view.settings.clamp_colors, DETACHED=view.settings.detach_directions, PLAIN=plain,
-            **effects(view, ctx.displacements),
-        )  # fmt: skip
-        return *outputs, v_screen, _of_gates(screen, sums), v_background, None, None, None, None
+        outputs, v_screen = empty_gradients(fields, ctx.terms, asked), transmittance.new_empty(len(fields[0]), 2)
+        for part in parts_of(fields, ctx.terms):
+            v_first, v_rest = (outputs[SHAPE + place] for place in part.places)
+            launch(
+                project_rows_backward, part.end - part.start, block_of(view),
+                *fields[:SHAPE], part.first, part.rest, given_or(ctx.displacements, fields[0]), screen.table,
+                screen.records, screen.tile_counts, sums, *outputs[:SHAPE], v_first, given_or(v_rest, v_first),
+                v_screen, part.start, part.end,
+                SUMS=sums.shape[1], TERMS=part.terms, STORED=part.stored, REST=v_rest is not None,
+                ANTIALIAS=view.settings.antialias, CLAMPED=view.settings.clamp_colors,
+                DETACHED=view.settings.detach_directions, PLAIN=plain, **effects(view, ctx.displacements),
+            )  # fmt: skip
+        return v_screen, _of_gates(screen, sums), v_background, *[None] * (_GIVEN - 3), *outputs
 
 
 def _of_gates(screen: Screen, sums: Float[Tensor, "n s"]) -> Float[Tensor, " n"] | None:

@@ -1,6 +1,6 @@
 """Prepares a scene for the pixel kernels: records of the visible rows, and the tiles' lists."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from sparsestreet.host_copy import HostCopy, copy_to_host
+from sparsestreet.ops.raster import SHAPE
 from sparsestreet.ops.triton.launch import launch
 from sparsestreet.ops.triton.lists import (
     PAIR_LIMIT,
@@ -88,19 +89,22 @@ def draw(
 def project_all(gaussians: Gaussians, view: KernelView, gates: Float[Tensor, " n"] | None = None) -> Projection:
     """Project all rows, as if their gates were 1, and put the gates into the records."""
     fields, displacements = fields_of(gaussians), contiguous(gaussians.displacements)
-    means, sh = fields[0], fields[4]
+    means, block = fields[0], block_of(view)
     n, settings, table = len(gaussians), view.settings, view.table(means.device)
     splats, radii = means.new_empty(n, LENGTH), means.new_empty(n)
     tile_counts = means.new_empty(n, dtype=torch.int32)
     # A program counts an empty scene too.
-    numbers = means.new_empty(3 * max(-(-n // block_of(view)), 1), dtype=torch.int64)
-    launch(
-        project_rows, max(n, 1), block_of(view),
-        *fields, given_or(displacements, means), table, splats, tile_counts, radii, numbers, n,
-        TERMS=sh.shape[1], ANTIALIAS=settings.antialias, CLAMPED=settings.clamp_colors,
-        HALF_COLORS=settings.half_colors, BOUNDED=view.bounded, **effects(view, displacements),
-        options={"enable_fp_fusion": False},
-    )  # fmt: skip
+    blocks = max(-(-n // block), 1)
+    numbers = means.new_empty(3 * blocks, dtype=torch.int64)
+    for part in parts_of(fields, gaussians.terms):
+        launch(
+            project_rows, max(part.end - part.start // block * block, 1), block,
+            *fields[:SHAPE], part.first, part.rest, given_or(displacements, means), table, splats, tile_counts, radii,
+            numbers, part.start, part.end, blocks,
+            TERMS=part.terms, STORED=part.stored, ANTIALIAS=settings.antialias, CLAMPED=settings.clamp_colors,
+            HALF_COLORS=settings.half_colors, BOUNDED=view.bounded, **effects(view, displacements),
+            options={"enable_fp_fusion": False},
+        )  # fmt: skip
     if gates is not None:
         splats[:, GATE_PLACE] = gates
     # Of one line, because torch sums the columns of a table one row after the other.
@@ -135,9 +139,40 @@ def read(sizes: Sizes, counted: HostCopy, gaussians: Gaussians, projection: Proj
 
 
 def fields_of(gaussians: Gaussians) -> tuple[Tensor, ...]:
-    """Means, quaternions, scales, opacities and harmonics as kernels read them."""
-    g = gaussians
-    return tuple(map(Tensor.contiguous, (g.means, g.quaternions, g.scales, g.opacities, g.sh)))
+    """Means, quaternions, scales, opacities and the tables of harmonics as kernels read them."""
+    return tuple(map(Tensor.contiguous, gaussians.learned()))
+
+
+@dataclass(frozen=True)
+class Part:
+    """Rows whose harmonics are of the same tables; kernels of rows are launched once for each."""
+
+    places: tuple[int, int]
+    """Of ``first`` and ``rest`` among all tables."""
+    start: int
+    end: int
+    first: Float[Tensor, "_ _ 3"]
+    rest: Float[Tensor, "_ _ 3"]
+    terms: int
+    """Coefficients in use."""
+    stored: int
+    """Of ``rest``; -1: ``first`` and ``rest`` are the one table of all."""
+
+
+def parts_of(fields: Sequence[Tensor], terms: int | None) -> list[Part]:
+    """The parts that have rows; one of no row if all are empty."""
+    if terms is None:
+        sh = fields[SHAPE]
+        return [Part((0, 0), 0, len(sh), sh, sh, sh.shape[1], -1)]
+    count, start, parts = (len(fields) - SHAPE) // 2, 0, []
+    for place in range(count):
+        first, rest = fields[SHAPE + place], fields[SHAPE + count + place]
+        stored, end = rest.shape[1], start + len(first)
+        # A table without numbers has no address.
+        rest = rest if stored else first
+        parts.append(Part((place, count + place), start, end, first, rest, min(1 + stored, terms), stored))
+        start = end
+    return [part for part in parts if part.end > part.start] or parts[:1]
 
 
 def contiguous(tensor: Tensor | None) -> Tensor | None:

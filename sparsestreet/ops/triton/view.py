@@ -53,6 +53,41 @@ def load_columns(table, row, mask, COUNT: tl.constexpr):
 
 
 @jit
+def places_of(first, rest, row, COLUMN: tl.constexpr, STORED: tl.constexpr):
+    """Where 16 numbers of each row's harmonics lie, from COLUMN on; STORED: the coefficients behind the first."""
+    column = (COLUMN + tl.arange(0, 16))[None, :]
+    place = rest + row[:, None] * (3 * STORED) + (column - 3)
+    # Elsewhere a choice of addresses would only take registers.
+    if COLUMN == 0:
+        place = tl.where(column < 3, first + row[:, None] * 3 + column, place)
+    return place, column
+
+
+@jit
+def load_harmonics(first, rest, row, mask, TERMS: tl.constexpr, STORED: tl.constexpr):
+    """The first TERMS coefficients of each lane's row, of two tables; 0 where the mask is off."""
+    tiles, columns = (), ()
+    for start in tl.static_range(0, 3 * TERMS, 16):
+        place, column = places_of(first, rest, row, start, STORED)
+        tiles += (tl.load(place, mask[:, None] & (column < 3 * TERMS), 0.0),)
+    for i in tl.static_range(len(tiles)):
+        columns += unzipped(tiles[i], 16)
+    return columns
+
+
+@jit
+def store_harmonics(first, rest, row, values, mask, TERMS: tl.constexpr, STORED: tl.constexpr, REST: tl.constexpr):
+    """The inverse; 0 behind the first TERMS. REST: whether more than the first coefficient is written."""
+    count: tl.constexpr = 3 + 3 * STORED if REST else 3
+    for start in tl.static_range(0, count, 16):
+        columns = ()
+        for i in tl.static_range(start, start + 16):
+            columns += (values[i] if i < 3 * TERMS else tl.zeros_like(values[0]),)
+        place, column = places_of(first, rest, row, start, STORED)
+        tl.store(place, zipped(columns, 16), mask[:, None] & (column < count))
+
+
+@jit
 def store_columns(table, row, values, mask, COUNT: tl.constexpr):
     width: tl.constexpr = 16 if COUNT % 16 == 0 else triton.next_power_of_2(COUNT)
     for first in tl.static_range(0, COUNT, width):

@@ -160,8 +160,8 @@ def test_two_renderings_before_one_backward_pass():
 def test_what_is_refused_is_refused_after_a_guess_too(monkeypatch):
     gaussians = cast(scene(), torch.float32, device=DEVICE)
     splat(gaussians, VIEW, backend="triton")
-    wrong = dataclasses.replace(gaussians, sh=gaussians.sh.clone())
-    wrong.sh[3, 0, 0] = torch.nan
+    wrong = dataclasses.replace(gaussians, sh=gaussians.dense_sh().clone())
+    wrong.dense_sh()[3, 0, 0] = torch.nan
     with pytest.raises(ValueError, match="sh must be finite, but row 3 has nan"):
         splat(wrong, VIEW, backend="triton")
     monkeypatch.setattr(lists, "PAIR_LIMIT", 3)

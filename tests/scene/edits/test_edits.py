@@ -49,8 +49,7 @@ def of(scene: SceneGraph, node: str = "cars", time: float = TIME):
     """The node's Gaussians in the world, as numpy."""
     found = scene.gaussians_at(view(time))
     rows = found.spans[node]
-    names = ("means", "quaternions", "scales", "opacities", "sh")
-    return {name: getattr(found.gaussians, name)[rows].double().numpy() for name in names}
+    return {name: column[rows].double().numpy() for name, column in found.gaussians.columns().items()}
 
 
 def box(scene: SceneGraph, instance: int, time: float = TIME) -> np.ndarray:

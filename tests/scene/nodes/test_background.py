@@ -19,14 +19,14 @@ def test_activations_by_hand():
     torch.testing.assert_close(gaussians.scales, torch.tensor([[0.5, 1.0, 2.0]]))
     torch.testing.assert_close(gaussians.opacities, torch.tensor([0.75]))
     assert torch.equal(gaussians.quaternions, columns["quaternions"])
-    assert torch.equal(gaussians.sh[:, :1], columns["sh_dc"])
-    assert torch.equal(gaussians.sh[:, 1:], columns["sh_rest"][:, :3])
+    assert torch.equal(gaussians.dense_sh()[:, :1], columns["sh_dc"])
+    assert torch.equal(gaussians.dense_sh()[:, 1:], columns["sh_rest"][:, :3])
 
 
 @pytest.mark.parametrize(("active", "terms"), [(0, 1), (1, 4), (2, 9), (3, 9)])
 def test_sh_terms_up_to_the_stored_degree(active: int, terms: int):
     node = background(random_rows(5, 0, sh_degree=2))
-    assert node.gaussians_at(view_at(0.0), degree(active)).sh.shape == (5, terms, 3)
+    assert node.gaussians_at(view_at(0.0), degree(active)).dense_sh().shape == (5, terms, 3)
 
 
 def test_extreme_opacity_logits_stay_finite():

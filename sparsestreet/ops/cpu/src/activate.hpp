@@ -8,7 +8,6 @@
 
 #include "exponential.hpp"
 #include "placement.hpp"
-#include "stream.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -21,17 +20,16 @@ inline int64_t rows_of_part(int64_t rows) {
 
 template <class T>
 struct StoredRows {
-  int64_t count, stored_rest, terms, stride;
+  int64_t count;
   T limit;
-  const T *means, *log_scales, *quaternions, *logits, *dc, *rest, *multipliers;
+  const T *means, *log_scales, *quaternions, *logits, *multipliers;
   const int64_t* instances;
   const T *turns, *shifts;  // quaternions and translations of the instances
   const uint8_t* present;
   explicit StoredRows(const RawRows& r)
-      : count(r.count), stored_rest(r.stored_rest), terms(r.terms), stride(r.stride), limit(T(r.logit_limit)),
+      : count(r.count), limit(T(r.logit_limit)),
         means(static_cast<const T*>(r.means)), log_scales(static_cast<const T*>(r.log_scales)),
         quaternions(static_cast<const T*>(r.quaternions)), logits(static_cast<const T*>(r.opacity_logits)),
-        dc(static_cast<const T*>(r.sh_dc)), rest(static_cast<const T*>(r.sh_rest)),
         multipliers(static_cast<const T*>(r.multipliers)), instances(r.instances),
         turns(static_cast<const T*>(r.pose_quaternions)), shifts(static_cast<const T*>(r.pose_translations)),
         present(r.present) {}
@@ -82,57 +80,18 @@ inline void place_row(const StoredRows<T>& in, const std::vector<Placement<T>>& 
   multiply(in.turns + 4 * i, in.quaternions + 4 * row, quaternion);
 }
 
-constexpr int64_t ROWS_AT_ONCE = 16;  // of coefficients, put together in the first cache
-
-template <class T>
-inline void coefficients_of(const StoredRows<T>& in, int64_t first, int64_t last, T* out) {
-  const int64_t rest = 3 * (in.terms - 1), width = 3 * in.stride;
-  T block[ROWS_AT_ONCE * 3 * 16];
-  for (int64_t row = first; row < last; row += ROWS_AT_ONCE) {
-    const int64_t count = std::min(ROWS_AT_ONCE, last - row);
-    for (int64_t k = 0; k < count; ++k) {
-      T* to = block + width * k;
-      std::memcpy(to, in.dc + 3 * (row + k), 3 * sizeof(T));
-      std::memcpy(to + 3, in.rest + 3 * in.stored_rest * (row + k), rest * sizeof(T));
-      std::memset(static_cast<void*>(to + 3 + rest), 0, (width - 3 - rest) * sizeof(T));
-    }
-    stream(out + width * row, block, width * count);
-  }
-  end_stream();
-}
-
-template <class T>
-inline void coefficients_backward(const StoredRows<T>& in, int64_t first, int64_t last, const T* v_sh, T* v_dc,
-                                  T* v_rest) {
-  const int64_t rest = 3 * (in.terms - 1), stored = 3 * in.stored_rest;
-  T block[ROWS_AT_ONCE * 3 * 15];
-  for (int64_t row = first; row < last; row += ROWS_AT_ONCE) {
-    const int64_t count = std::min(ROWS_AT_ONCE, last - row);
-    for (int64_t k = 0; k < count; ++k) {
-      const T* from = v_sh + 3 * in.stride * (row + k);
-      std::memcpy(v_dc + 3 * (row + k), from, 3 * sizeof(T));
-      if (!v_rest) continue;
-      std::memcpy(block + stored * k, from + 3, rest * sizeof(T));
-      std::memset(static_cast<void*>(block + stored * k + rest), 0, (stored - rest) * sizeof(T));
-    }
-    if (v_rest) stream(v_rest + stored * row, block, stored * count);
-  }
-  end_stream();
-}
-
 template <class T>
 void activate(const RawRows& r, const ActiveRows& out) {
   const StoredRows<T> in(r);
   const auto poses = instance_poses(r, in);
   T *means = static_cast<T*>(out.means), *quaternions = static_cast<T*>(out.quaternions);
-  T *scales = static_cast<T*>(out.scales), *opacities = static_cast<T*>(out.opacities), *sh = static_cast<T*>(out.sh);
+  T *scales = static_cast<T*>(out.scales), *opacities = static_cast<T*>(out.opacities);
   const int64_t part = rows_of_part(in.count);
 #pragma omp parallel for num_threads(r.threads) schedule(static)
   for (int64_t first = 0; first < in.count; first += part) {
     const int64_t last = std::min(first + part, in.count);
     scales_of(in, first, last - first, scales + 3 * first);
     opacities_of(in, first, last - first, opacities + first);
-    coefficients_of(in, first, last, sh);
     if (in.multipliers)
       for (int64_t row = first; row < last; ++row) {
         for (int c = 0; c < 3; ++c) scales[3 * row + c] *= in.multipliers[row];
@@ -178,7 +137,7 @@ inline void place_row_backward(const StoredRows<T>& in, const std::vector<Placem
   for (int k = 0; k < 4; ++k) sums.turn[k] += v_turn[k];
 }
 
-// Of the rows first to last: scales, opacities, what multiplies both, and the coefficients.
+// Of the rows first to last: scales, opacities, and what multiplies both.
 template <class T>
 inline void activate_rows_backward(const StoredRows<T>& in, int64_t first, int64_t last, const ActiveRows& v,
                                    const RawGradients& out) {
@@ -198,8 +157,6 @@ inline void activate_rows_backward(const StoredRows<T>& in, int64_t first, int64
     const bool held = in.logits[row] > in.limit || in.logits[row] < -in.limit;
     v_logits[row] = held ? T(0) : v_opacities[row] * multiplier * presence * opacity * (1 - opacity);
   }
-  coefficients_backward(in, first, last, static_cast<const T*>(v.sh), static_cast<T*>(out.sh_dc),
-                        static_cast<T*>(out.sh_rest));
 }
 
 template <class T>

@@ -52,13 +52,20 @@ inline Lanes<T> row_sums(Lanes<T>* square) {
   return square[0];
 }
 
-// out[c] lane r = row(r)[c]; row(r) must be readable for every lane.
+// out[c] lane r = row(r)[c]; row(r) must be readable for every lane. A last square that is not full begins earlier.
 template <class T, class RowAt>
 inline void load_columns(RowAt row, int columns, Lanes<T>* out) {
   int c = 0;
   for (; c + LANES<T> <= columns; c += LANES<T>) {
     for (int r = 0; r < LANES<T>; ++r) out[c + r] = load<T>(row(r) + c);
     transpose<T>(out + c);
+  }
+  if (c < columns && columns > LANES<T>) {
+    Lanes<T> square[LANES<T>];
+    const int from = columns - LANES<T>;
+    for (int r = 0; r < LANES<T>; ++r) square[r] = load<T>(row(r) + from);
+    transpose<T>(square);
+    for (; c < columns; ++c) out[c] = square[c - from];
   }
   for (; c < columns; ++c)
     for (int r = 0; r < LANES<T>; ++r) out[c][r] = row(r)[c];
@@ -68,12 +75,14 @@ inline void load_columns(RowAt row, int columns, Lanes<T>* out) {
 template <class T, class RowAt>
 inline void store_columns(const Lanes<T>* in, int columns, RowAt row) {
   int c = 0;
-  for (; c + LANES<T> <= columns; c += LANES<T>) {
+  const auto store_square = [&](int from) {
     Lanes<T> square[LANES<T>];
-    for (int r = 0; r < LANES<T>; ++r) square[r] = in[c + r];
+    for (int r = 0; r < LANES<T>; ++r) square[r] = in[from + r];
     transpose<T>(square);
-    for (int r = 0; r < LANES<T>; ++r) store<T>(row(r) + c, square[r]);
-  }
+    for (int r = 0; r < LANES<T>; ++r) store<T>(row(r) + from, square[r]);
+  };
+  for (; c + LANES<T> <= columns; c += LANES<T>) store_square(c);
+  if (c < columns && columns > LANES<T>) store_square(columns - LANES<T>), c = columns;
   for (; c < columns; ++c)
     for (int r = 0; r < LANES<T>; ++r) row(r)[c] = in[c][r];
 }

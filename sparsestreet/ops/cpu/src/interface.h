@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 16;
+constexpr int32_t INTERFACE_VERSION = 17;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -31,10 +31,21 @@ struct View {
   int64_t threads;
 };
 
+// Spherical harmonics of rows that follow each other, and where their gradients go. `rest` are the coefficients behind
+// the first; of a table that holds both, it is three numbers further. Strides are numbers between rows.
+struct Harmonics {
+  int64_t rows, terms;   // terms: coefficients in use
+  int64_t stored_rest;   // coefficients of `rest`, also those not in use, whose gradients are 0
+  int64_t first_stride, rest_stride;
+  const void *first, *rest;
+  void *v_first, *v_rest;  // of backward; v_rest null: not asked for
+};
+
 // Activated Gaussians; pointers to float or double.
 struct Rows {
-  int64_t count, terms;  // terms: spherical harmonics per channel
-  const void *means, *quaternions, *scales, *opacities, *sh;
+  int64_t count, tables;
+  const Harmonics* harmonics;  // [tables], of all rows in order
+  const void *means, *quaternions, *scales, *opacities;
   const void* displacements;  // null: none
   const void* gates;          // factors of alpha in every pixel, null: 1
 };
@@ -44,10 +55,10 @@ struct Layers {
   void *rgb, *transmittance, *depth_sum;
 };
 
-// Gradients of the rows; screen: sum over pixels of |dLoss / d mean on the screen|, of plain_gradients without the bars,
+// Gradients of the rows but those of harmonics; screen: sum over pixels of |dLoss / d mean on the screen|, of plain_gradients without the bars,
 // [n,2]; gates: null if the rows have none.
 struct RowGradients {
-  void *means, *quaternions, *scales, *opacities, *sh, *screen, *gates;
+  void *means, *quaternions, *scales, *opacities, *screen, *gates;
 };
 
 struct Counters {
@@ -95,12 +106,11 @@ struct Report {
   int64_t worst_rows[3], worst_pairs[3];
 };
 
-// Rows as a node stores them; null: multipliers (1), instances (no poses).
+// Rows as a node stores them, without harmonics; null: multipliers (1), instances (no poses).
 struct RawRows {
-  int64_t count, stored_rest, terms;  // coefficients behind the first that are stored; all that are used
-  int64_t stride;                     // coefficients of a row as it is splatted; those not used are 0
+  int64_t count;
   double logit_limit;
-  const void *means, *log_scales, *quaternions, *opacity_logits, *sh_dc, *sh_rest, *multipliers;
+  const void *means, *log_scales, *quaternions, *opacity_logits, *multipliers;
   const int64_t* instances;  // of the rows
   int64_t num_instances;
   const void *pose_quaternions, *pose_translations;
@@ -110,12 +120,12 @@ struct RawRows {
 
 // Activated rows or their gradients.
 struct ActiveRows {
-  void *means, *quaternions, *scales, *opacities, *sh;
+  void *means, *quaternions, *scales, *opacities;
 };
 
 // Null: what is not asked for.
 struct RawGradients {
-  void *means, *log_scales, *quaternions, *opacity_logits, *sh_dc, *sh_rest, *multipliers;
+  void *means, *log_scales, *quaternions, *opacity_logits, *multipliers;
   void *pose_quaternions, *pose_translations;
 };
 

@@ -2,21 +2,28 @@
 #pragma once
 #include <omp.h>
 
+#include <vector>
+
 #include "columns.hpp"
 #include "pairs.hpp"
+#include "tables.hpp"
 
 namespace SPLAT_VARIANT {
 
 // Typed views of the input rows.
 template <class T>
 struct Inputs {
-  int64_t count, terms;
-  const T *means, *quaternions, *scales, *opacities, *sh, *displacements, *gates;
+  int64_t count;
+  std::vector<HarmonicTable<T>> harmonics;
+  const T *means, *quaternions, *scales, *opacities, *displacements, *gates;
   explicit Inputs(const Rows& r)
-      : count(r.count), terms(r.terms), means(static_cast<const T*>(r.means)),
-        quaternions(static_cast<const T*>(r.quaternions)), scales(static_cast<const T*>(r.scales)),
-        opacities(static_cast<const T*>(r.opacities)), sh(static_cast<const T*>(r.sh)),
-        displacements(static_cast<const T*>(r.displacements)), gates(static_cast<const T*>(r.gates)) {}
+      : count(r.count), means(static_cast<const T*>(r.means)), quaternions(static_cast<const T*>(r.quaternions)),
+        scales(static_cast<const T*>(r.scales)), opacities(static_cast<const T*>(r.opacities)),
+        displacements(static_cast<const T*>(r.displacements)), gates(static_cast<const T*>(r.gates)) {
+    int64_t begin = 0;
+    for (const Harmonics* h = r.harmonics; h != r.harmonics + r.tables; begin += h->rows, ++h)
+      harmonics.emplace_back(*h, begin);
+  }
 };
 
 // Whether all values are finite: no exponent is all ones. In integers, which the compiler vectorizes.
@@ -70,25 +77,29 @@ inline typename E::template Row<Lanes<T>> load_rows(const Inputs<T>& in, RowAt r
   return v;
 }
 
-// The color of the rows of a register in the direction in which the camera sees them.
+// The color of the rows of a register in the direction in which the camera sees them; answers whose coefficients are
+// finite.
 template <class T, class RowAt>
-inline void color_rows(const Camera<T>& camera, const Inputs<T>& in, RowAt row, const Vector<Lanes<T>>& in_camera,
-                       Splat<Lanes<T>>& s) {
+inline Integers<T> color_rows(const Camera<T>& camera, const HarmonicTable<T>& table, RowAt row,
+                              const Vector<Lanes<T>>& in_camera, Splat<Lanes<T>>& s) {
   Lanes<T> sh[3 * 16];
-  load_columns<T>([&](int lane) { return in.sh + 3 * in.terms * row(lane); }, int(3 * in.terms), sh);
-  const Vector<Lanes<T>> color = view_color(camera, in_camera, sh, in.terms).raw;
+  table.load(row, sh);
+  Integers<T> finite = ~Integers<T>{};
+  for (int c = 0; c < 3 * table.terms; ++c) finite &= sh[c] - sh[c] == T(0);
+  const Vector<Lanes<T>> color = view_color(camera, in_camera, sh, table.terms).raw;
   s.color[0] = positive_part(color.x), s.color[1] = positive_part(color.y), s.color[2] = positive_part(color.z);
   if (camera.clamp_colors)
     for (auto& channel : s.color) channel = channel < T(1) ? channel : same(T(1));
   if (camera.half_colors)
     for (auto& channel : s.color) channel = rounded_to_half<T>(channel);
+  return finite;
 }
 
-// Rows `first` to `first + count` (at most LANES of them): fills their splats, tiles and radii, counts pairs per tile;
-// false if a row that is drawn has a bad coefficient.
+// Rows `first` to `first + count` (at most LANES of them, of one table): fills their splats, tiles and radii, counts
+// pairs per tile; false if a row that is drawn has a bad coefficient.
 template <class E, class T>
 bool project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& grid, const Inputs<T>& in, int64_t first,
-                   int count, T* radii, int64_t* counts) {
+                   int count, const HarmonicTable<T>& table, T* radii, int64_t* counts) {
   // The lanes of a last, partial block repeat its last row.
   const auto row = [&](int lane) { return first + (lane < count ? lane : count - 1); };
   const auto values = load_rows<E>(in, row);
@@ -102,7 +113,7 @@ bool project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
     for (int r = 0; r < count; ++r) ws.tiles[first + r].count = 0, ws.tiles[first + r].mask = 0;
     return true;
   }
-  color_rows(camera, in, row, p.placement.mean, s);
+  const Integers<T> sound = color_rows(camera, table, row, p.placement.mean, s);
   if (in.gates) load_columns<T>([&](int lane) { return in.gates + row(lane); }, 1, &s.gate);
   Splat<T>* splats = &ws.splats[first];
   store_columns<T>(&s.x, SPLAT_COLUMNS<T>, [&](int r) { return reinterpret_cast<T*>(&ws.splats[row(r)]); });
@@ -111,9 +122,7 @@ bool project_block(Workspace<T>& ws, const Camera<T>& camera, const Grid<T>& gri
     ws.tiles[first + r].depth_key = depth_key(splats[r].depth, camera.depth_bits);
     for_each_tile(ws.tiles[first + r], splats[r], grid, [&](int64_t tile) { ++counts[tile]; });
   }
-  bool sound = true;
-  for (int r = 0; r < count; ++r) sound &= !seen[r] || finite(in.sh + 3 * in.terms * (first + r), 3 * in.terms);
-  return sound;
+  return !any<T>(seen & ~sound);
 }
 
 // Fills ws.splats, ws.tiles, `radii` and each thread's counts of pairs per tile; false if a row holds a bad value.
@@ -128,11 +137,14 @@ bool project_rows(Workspace<T>& ws, const View& view, const Inputs<T>& in, T* ra
   for (int64_t part = 0; part < view.threads; ++part) {
     int64_t* counts = &ws.histogram[part * tiles];
     std::memset(counts, 0, tiles * sizeof(int64_t));
-    const Range range = blocks_of_part<T>(in.count, part, view.threads);
-    for (int64_t first = range.begin; first < range.end; first += LANES<T>) {
-      const int count = int(range.end - first < LANES<T> ? range.end - first : LANES<T>);
-      bad |= !valid_rows(in, first, count);
-      bad |= !project_block<E>(ws, camera, grid, in, first, count, radii, counts);
+    const Range whole = blocks_of_part<T>(in.count, part, view.threads);
+    for (const HarmonicTable<T>& table : in.harmonics) {
+      const Range range = table.within(whole);
+      for (int64_t first = range.begin; first < range.end; first += LANES<T>) {
+        const int count = int(range.end - first < LANES<T> ? range.end - first : LANES<T>);
+        bad |= !valid_rows(in, first, count);
+        bad |= !project_block<E>(ws, camera, grid, in, first, count, table, radii, counts);
+      }
     }
   }
   return !bad;

@@ -4,7 +4,6 @@
 #include <omp.h>
 
 #include "prepare.hpp"
-#include "stream.hpp"
 
 namespace SPLAT_VARIANT {
 
@@ -108,21 +107,19 @@ inline RowValues<V> row_backward(const Camera<T>& camera, const RowValues<V>& ro
   return out;
 }
 
-// Typed views of the gradients.
+// Typed views of the gradients but those of harmonics.
 template <class T>
 struct Outputs {
-  int64_t terms;
-  T *means, *quaternions, *scales, *opacities, *sh, *screen;
-  Outputs(const RowGradients& g, int64_t terms)
-      : terms(terms), means(static_cast<T*>(g.means)), quaternions(static_cast<T*>(g.quaternions)),
-        scales(static_cast<T*>(g.scales)), opacities(static_cast<T*>(g.opacities)), sh(static_cast<T*>(g.sh)),
-        screen(static_cast<T*>(g.screen)) {}
+  T *means, *quaternions, *scales, *opacities, *screen;
+  explicit Outputs(const RowGradients& g)
+      : means(static_cast<T*>(g.means)), quaternions(static_cast<T*>(g.quaternions)),
+        scales(static_cast<T*>(g.scales)), opacities(static_cast<T*>(g.opacities)), screen(static_cast<T*>(g.screen)) {}
 
   void set_zero(int64_t first, int64_t last) const {
     const auto zero = [&](T* values, int64_t width) {
       stream<T>(values + width * first, nullptr, width * (last - first));
     };
-    zero(means, 3), zero(quaternions, 4), zero(scales, 3), zero(opacities, 1), zero(sh, 3 * terms), zero(screen, 2);
+    zero(means, 3), zero(quaternions, 4), zero(scales, 3), zero(opacities, 1), zero(screen, 2);
   }
 };
 
@@ -142,63 +139,63 @@ inline Slot<Lanes<T>> sum_slots(const Workspace<T>& ws, RowAt row) {
   return sum;
 }
 
-// A register of visible rows, which may repeat.
+// A register of visible rows of one table, which may repeat.
 template <class E, class T>
-void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
-                    const int64_t* rows) {
+void backward_block(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const HarmonicTable<T>& table,
+                    const Outputs<T>& out, const int64_t* rows) {
   using V = Lanes<T>;
   const auto row = [&](int lane) { return rows[lane]; };
-  const int coefficients = int(3 * in.terms);
   Splat<V> splat;
   load_columns<T>([&](int r) { return reinterpret_cast<const T*>(&ws.splats[row(r)]); }, SPLAT_COLUMNS<T>, &splat.x);
   const auto values = load_rows<E>(in, row);
   const Projection<E, V> p(camera, values);
   const ScreenGradient<V> g = screen_gradient(sum_slots(ws, row), splat);
   V sh[3 * 16], v_sh[3 * 16];
-  load_columns<T>([&](int r) { return in.sh + 3 * in.terms * row(r); }, coefficients, sh);
-  const Vector<V> v_color = color_backward(camera, p.placement.mean, g.color, sh, in.terms, v_sh);
+  table.load(row, sh);
+  const Vector<V> v_color = color_backward(camera, p.placement.mean, g.color, sh, table.terms, v_sh);
   const RowValues<V> v = row_backward(camera, values, p, g, v_color);
   store_columns<T>(&v.mean.x, 3, [&](int r) { return out.means + 3 * row(r); });
   store_columns<T>(v.quaternion, 4, [&](int r) { return out.quaternions + 4 * row(r); });
   store_columns<T>(&v.scales.x, 3, [&](int r) { return out.scales + 3 * row(r); });
   store_columns<T>(&v.opacity, 1, [&](int r) { return out.opacities + row(r); });
-  store_columns<T>(v_sh, coefficients, [&](int r) { return out.sh + 3 * in.terms * row(r); });
+  table.store_gradients(v_sh, row);
   store_columns<T>(camera.plain_gradients ? &g.x : &g.abs_x, 2, [&](int r) { return out.screen + 2 * row(r); });
 }
 
-// Rows `range` of the input: culled ones, which neighbor each other, get zeros, the others are gathered until they fill
+// Rows `range` of the input, of one table: culled ones, which neighbor each other, get zeros, the others are gathered until they fill
 // a register. In which lane a row is computed does not change its bits.
 template <class E, class T>
-void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const Outputs<T>& out,
-                    const Range& range) {
+void backward_range(const Workspace<T>& ws, const Camera<T>& camera, const Inputs<T>& in, const HarmonicTable<T>& table,
+                    const Outputs<T>& out, const Range& range) {
   int64_t rows[LANES<T>];
   int count = 0;
   for (int64_t i = range.begin; i < range.end; ++i) {
     if (ws.tiles[i].count == 0) {
       const int64_t first = i;
       while (i + 1 < range.end && ws.tiles[i + 1].count == 0) ++i;
-      out.set_zero(first, i + 1);
+      out.set_zero(first, i + 1), table.zero_gradients(first, i + 1);
       continue;
     }
     rows[count++] = i;
-    if (count == LANES<T>) backward_block<E>(ws, camera, in, out, rows), count = 0;
+    if (count == LANES<T>) backward_block<E>(ws, camera, in, table, out, rows), count = 0;
   }
   end_stream();
   if (count == 0) return;
   for (int lane = count; lane < LANES<T>; ++lane) rows[lane] = rows[count - 1];
-  backward_block<E>(ws, camera, in, out, rows);
+  backward_block<E>(ws, camera, in, table, out, rows);
 }
 
 template <class T>
 void project_backward(Workspace<T>& ws, const View& view, const Rows& rows, const RowGradients& gradients) {
   const double start = omp_get_wtime();
   const Inputs<T> in(rows);
-  const Outputs<T> out(gradients, in.terms);
+  const Outputs<T> out(gradients);
   const Camera<T> camera(view);
   with_effects(view, [&](auto effects) {
 #pragma omp parallel for num_threads(view.threads) schedule(static)
     for (int64_t part = 0; part < view.threads; ++part)
-      backward_range<decltype(effects)>(ws, camera, in, out, Range(in.count, part, view.threads));
+      for (const HarmonicTable<T>& table : in.harmonics)
+        backward_range<decltype(effects)>(ws, camera, in, table, out, table.within({in.count, part, view.threads}));
   });
   ws.seconds[PROJECT_BACKWARD] = omp_get_wtime() - start;
 }
