@@ -8,11 +8,14 @@ import torch
 from sparsestreet.ranks import Ranks
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.training.callbacks import DensityControl, density_control
+from sparsestreet.training.forecast import bytes_of_row
 from sparsestreet.training.system import StreetSystem
 from tests.training.callbacks.refining import every_ten, started
 from tests.training.stubs import Listener, background
 
 GROWS_ALL = GradientDensity(grad_threshold=1e-12, cull_opacity=0.0, cull_scale=1e9)
+EACH = bytes_of_row(background(1).rows, moved=False)
+"""Bytes of one more Gaussian, as ``test_memory.py`` compares them with what a step allocates."""
 
 
 def grown(monkeypatch: pytest.MonkeyPatch, *free: float) -> tuple[DensityControl, StreetSystem, Listener]:
@@ -34,23 +37,22 @@ def rows_after(listener: Listener) -> list[int]:
 
 
 def test_memory_holds_growth_back_which_is_said_once(monkeypatch, caplog):
-    """20 rows of 59 numbers and a label of 8 bytes each would be 60."""
-    each = 4 * (59 * 4 + 8) + 350
+    """20 rows would be 60."""
     with caplog.at_level(logging.WARNING):
-        _, system, listener = grown(monkeypatch, 6 * each, 0.5 * each)
+        _, system, listener = grown(monkeypatch, 6 * EACH, 0.5 * EACH)
     first, second = rows_after(listener)
     assert 20 < first <= 26
     assert second == first
     assert system.held_back == {"background": 40 - 6 + 2 * first}
     (said,) = [record.message for record in caplog.records if "memory" in record.message]
-    assert said.startswith(f"step 10: 'background' would grow by 40 Gaussians of {each:,} bytes each, and memory has")
+    assert said.startswith(f"step 10: 'background' would grow by 40 Gaussians of {EACH:,} bytes each, and memory has")
     assert " room for 6: no more are added." in said
 
 
 def test_where_memory_has_room_nothing_changes(monkeypatch):
     """Not even the draws: rows are those of a run that is not asked."""
     ends = []
-    for free in (float("inf"), 40 * (4 * (59 * 4 + 8) + 350.0)):
+    for free in (float("inf"), 40.0 * EACH):
         _, system, _ = grown(monkeypatch, free)
         assert system.held_back == {}
         ends.append(system.scene.nodes["background"].rows)
@@ -60,7 +62,7 @@ def test_where_memory_has_room_nothing_changes(monkeypatch):
 
 def test_what_fits_is_what_a_limit_would_allow(monkeypatch):
     """A plan that is made again draws the same numbers."""
-    _, system, _ = grown(monkeypatch, 6 * (4 * (59 * 4 + 8) + 350.0))
+    _, system, _ = grown(monkeypatch, 6.0 * EACH)
     strategy = GROWS_ALL
     limited = every_ten()
     monkeypatch.setattr(density_control, "bytes_for_growth", lambda device: float("inf"))
@@ -81,7 +83,7 @@ def test_several_processes_add_what_the_fullest_has_room_for(monkeypatch):
         def largest(self, values):
             if values.dim() == 0:
                 heard.append(float(values))
-                return torch.maximum(values, torch.tensor(-3 * (4 * (59 * 4 + 8) + 350.0), dtype=torch.float64))
+                return torch.maximum(values, torch.tensor(-3.0 * EACH, dtype=torch.float64))
             return values
 
         def sum(self, values):
