@@ -193,4 +193,4 @@ def _said(done: int, total: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_command("gpu_pack", __doc__, sys.argv[1:] or ["wheels=true"], PackRequest, pack))
+    sys.exit(run_command("gpu_pack", __doc__ or "", sys.argv[1:] or ["wheels=true"], PackRequest, pack))
