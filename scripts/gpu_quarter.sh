@@ -133,6 +133,7 @@ run_frames() { # part, scenes...
 
 run_training() { # seconds
   local options=("out=$PLAIN")
+  [ ! -f "$PLAIN/records/summary.json" ] || { skip train "it is finished"; return; }
   # The same command goes on; on a bare machine it is another run, whose steps fit into the time.
   if [ "$CALL" = second ] && { [ ! -d "$PLAIN" ] || [ -f "$STAY/runs/budget" ]; }; then
     touch "$STAY/runs/budget"
@@ -179,7 +180,7 @@ call_second() {
   run_pruned "$(left 110)"
   run_frames frames2 "$PLAIN" "$PRUNED"
   finish_gsplat
-  run_bench street 50 "$PLAIN" enlarge=2 "rows=[]"
+  run_bench street 50 "$PLAIN" enlarge=2 "rows=[100000]"
   run_export export2 "$PRUNED"
   run_export export "$PLAIN"
 }

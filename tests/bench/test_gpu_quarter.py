@@ -252,6 +252,8 @@ def test_a_dry_run_of_both_calls_with_what_travels(tmp_path, packing):
         )
         table = (tmp_path / "stay" / call / "table.txt").read_text(encoding="utf-8").splitlines()
         states = {line[:8].strip(): line[9:17].strip() for line in table if line[25:26] == "s"}
-        assert {part: states.get(part) for part in parts} == dict.fromkeys(parts, "ok"), said.stdout + said.stderr
+        # So few steps are finished in the first call.
+        expected = dict.fromkeys(parts, "ok") | ({"train": "skipped"} if call == "second" else {})
+        assert {part: states.get(part) for part in parts} == expected, said.stdout + said.stderr
         assert said.returncode == 0
         assert any(line.startswith("DRY RUN") for line in table)
