@@ -133,7 +133,10 @@ run_frames() { # part, scenes...
 
 run_training() { # seconds
   local options=("out=$PLAIN")
-  [ ! -f "$PLAIN/records/summary.json" ] || { skip train "it is finished"; return; }
+  if [ -f "$PLAIN/records/summary.json" ] && [ ! -f "$PLAIN/checkpoints/interrupted.ckpt" ]; then
+    skip train "it is finished"
+    return
+  fi
   # The same command goes on; on a bare machine it is another run, whose steps fit into the time.
   if [ "$CALL" = second ] && { [ ! -d "$PLAIN" ] || [ -f "$STAY/runs/budget" ]; }; then
     touch "$STAY/runs/budget"

@@ -138,6 +138,7 @@ elif " train " in given:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(name)
     if "resume=" not in given and MODE == "long":
+        path.with_name("interrupted.ckpt").write_text("")
         sys.exit(124)
 elif " export " in given:
     call("export")
