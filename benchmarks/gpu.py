@@ -560,15 +560,13 @@ python -m benchmarks.gpu [key=value ...]     a CUDA device at 0.1 to 5 M splats,
   python -m benchmarks.gpu street=RUN                      and the street of a trained run, before them
   python -m benchmarks.gpu street=RUN enlarge=2 rows=1000  also in images twice as wide and high; few random splats
   python -m benchmarks.gpu street=scene.street refine=3    of nine splats for each, seen three times as large
-  python -m benchmarks.gpu first=gsplat compares=false     gsplat before us: call both, and believe what both say
-  python -m benchmarks.gpu quick=true                      tiny sizes, also without a device: to see that it runs
 
-  quick     true: tiny sizes and few repeats, whose times mean little
+  quick     true: tiny sizes and few repeats, also without a device: to see that it runs
   street    a run's folder, a .street or a scene.safetensors beside its views.json: its front camera, in two frames
   refine    how many times as large the street is seen, each splat cut into refine x refine (default: 1)
   enlarge   factor of the larger images (default: 1)
   rows      numbers of random splats (default: those of the tables in docs/gpu.md)
-  first     ours or gsplat: which is measured first at each size (default: ours)
+  first     ours or gsplat: which is measured first; call both, and believe what both say (default: ours)
   compares  false: images and gradients are not compared
   out       folder for gpu.jsonl (default: outputs/bench)
 """
