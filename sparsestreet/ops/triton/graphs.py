@@ -31,7 +31,7 @@ from sparsestreet.ops.triton.screen import Screen, list_in, project_all, read
 from sparsestreet.ops.triton.view import KernelView
 
 Answer = TypeVar("Answer")
-MOST = 8
+MAX_KEPT = 8
 """Kinds of views that are kept. Each holds what a rendering and its backward pass need, in memory of its own."""
 
 
@@ -51,7 +51,7 @@ COUNTS = Counts()
 
 
 class Images(NamedTuple):
-    """As in a Rendering."""
+    """The tensors of a Rendering."""
 
     rgb: Float[Tensor, "h w 3"]
     alpha: Float[Tensor, "h w"]
@@ -107,7 +107,7 @@ def _forget() -> None:
     for key, graph in list(_kept.items()):
         if graph is not None and graph.is_stale:
             del _kept[key]
-    while len(_kept) >= MOST:
+    while len(_kept) >= MAX_KEPT:
         _kept.popitem(last=False)
 
 

@@ -83,21 +83,21 @@ class _Blend(torch.autograd.Function):
         ctx, screen_offsets, gates, background, displacements, view, differentiated, changes, terms, replay, *fields
     ):  # fmt: skip
         ctx.set_materialize_grads(False)
-        gaussians = Gaussians.of_learned(fields, terms, displacements)
-        inputs = Inputs(fields_of(gaussians), terms, displacements, contiguous(background), view)
-        ctx.view, ctx.displacements, ctx.terms = view, displacements, terms
-        replayed = graphs.drawn(inputs, differentiated) if replay else None
-        if replayed is not None:
-            ctx.lease, images = replayed
-            ctx.mark_non_differentiable(images.radii)
-            ctx.save_for_backward(*inputs.fields, inputs.background)
-            return tuple(images)
-        ctx.lease = None
+        gaussians, background = Gaussians.of_learned(fields, terms, displacements), contiguous(background)
+        fields = fields_of(gaussians)
+        ctx.view, ctx.displacements, ctx.terms, ctx.lease = view, displacements, terms, None
+        if replay:
+            replayed = graphs.drawn(Inputs(fields, terms, displacements, background, view), differentiated)
+            if replayed is not None:
+                ctx.lease, images = replayed
+                ctx.mark_non_differentiable(images.radii)
+                ctx.save_for_backward(*fields, background)
+                return tuple(images)
         screen, drawn = draw(
-            inputs.gaussians, view, lambda screen: blend_view(screen, view, differentiated, inputs.background), gates
+            gaussians, view, lambda screen: blend_view(screen, view, differentiated, background), gates
         )  # fmt: skip
         ctx.mark_non_differentiable(screen.radii)
-        ctx.save_for_backward(*inputs.fields, inputs.background, drawn.ends.transmittance, drawn.depth)
+        ctx.save_for_backward(*fields, background, drawn.ends.transmittance, drawn.depth)
         ctx.screen, ctx.lasts, ctx.parts, ctx.changes = screen, drawn.ends.lasts, drawn.ends.parts, changes
         return drawn.rgb, drawn.alpha, drawn.depth, screen.radii
 

@@ -180,7 +180,7 @@ def test_frames_without_gradients_are_replayed_and_stay():
 
 
 def test_graphs_of_tables_that_are_gone_are_forgotten_and_few_are_kept(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(graphs, "MOST", 2)
+    monkeypatch.setattr(graphs, "MAX_KEPT", 2)
     with torch.no_grad():
         for width in (4, 5, 6):
             splat(scene(0), front_camera(width, 3, 4.0), backend="triton", replay=True)
