@@ -14,6 +14,7 @@ from sparsestreet.atomic import atomic_file
 from sparsestreet.data.images import image_size, mask_png, read_image, read_mask
 from sparsestreet.data.reader import LogReader
 from sparsestreet.data.recording import RecordedReader, Recording
+from sparsestreet.segmentation.classes import KINDS
 from sparsestreet.segmentation.model import Segmenter
 
 RECORD = "masks.json"
@@ -99,7 +100,7 @@ def write_masks(
     Raises ValueError where the folder has masks of another log, segmenter or version; then nothing was written. Raises
     LogError for an image that cannot be read, and OSError where nothing can be written.
     """
-    _take(folder, _record(log, segmenter), log.kinds)
+    _take(folder, _record(log, segmenter))
     files = [log.paths(place, folder) for place in range(len(log))]
     wanted = [place for place, paths in enumerate(files) if not all(map(Path.is_file, paths.values()))]
     total, covered = 0, dict.fromkeys(log.kinds, 0)
@@ -113,15 +114,16 @@ def write_masks(
     return WrittenMasks(len(wanted), len(log) - len(wanted), shares)
 
 
-def _take(folder: Path, record: Mapping[str, Any], kinds: Sequence[str]) -> None:
-    """Write the record of a new folder. Raises ValueError where the folder is of other masks."""
+def _take(folder: Path, record: Mapping[str, Any]) -> None:
+    """Write the record of a folder without masks. Raises ValueError where its masks are others."""
     path, remedy = folder / RECORD, "remove it, or name another folder with to=..."
-    if not path.is_file():
-        if there := [kind for kind in kinds if (folder / kind).exists()]:
-            raise ValueError(f"{folder / there[0]} is there, and no {RECORD} says by which segmenter: {remedy}")
+    there = [kind for kind in KINDS if any((folder / kind).rglob("*.png"))]
+    if not there:
         with atomic_file(path) as file:
             file.write_text(json.dumps(record, indent=1) + "\n")
         return
+    if not path.is_file():
+        raise ValueError(f"{folder / there[0]} is there, and no {RECORD} says by which segmenter: {remedy}")
     try:
         found = json.loads(path.read_bytes())
         changed = [key for key in {**record, **found} if found.get(key) != record.get(key)]
