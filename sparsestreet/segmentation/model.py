@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 
-from sparsestreet.atomic import check_regular
 from sparsestreet.segmentation.classes import SegmentationClasses
 
 MULTIPLE = 32
@@ -53,7 +52,7 @@ class Preparation:
 
 
 class Segmenter:
-    """A model that answers with a score for each class and pixel, or with a class for each pixel."""
+    """A model whose first output is a score for each class and pixel, or a class for each pixel."""
 
     def __init__(self, path: Path, classes: SegmentationClasses, preparation: Preparation, threads: int = 0) -> None:
         """
@@ -61,7 +60,7 @@ class Segmenter:
             path: of the model; weights that it keeps in other files lie beside it.
             classes: that it tells apart.
             preparation: of images, as it was trained.
-            threads: of the processor; 0: as onnxruntime chooses.
+            threads: of the processor; 0: as many as this process has processors.
 
         Raises ModuleNotFoundError without onnxruntime, OSError for a file that is not there, and ValueError for one
         that is no model of one image.
@@ -105,8 +104,8 @@ class Segmenter:
         Raises ValueError where the model fails on the image, or answers with something else than its classes.
         """
         height, width = image.shape[:2]
-        asked = [self._session.get_outputs()[0].name]
         try:
+            asked = [self._session.get_outputs()[0].name]
             answer = np.asarray(self._session.run(asked, {self._input.name: self._seen(image)})[0])
         except Exception as error:  # each of onnxruntime's is a class of its own
             message = f"{self.path} fails on an image of {width}x{height} ({_said(error)})"
@@ -134,9 +133,9 @@ def _opened(path: Path, threads: int) -> Any:
         raise ModuleNotFoundError(f"masks need {error.name}: pip install 'sparsestreet[masks]'") from error
     if not path.is_file():
         raise FileNotFoundError(f"model={path} is no file: name the model, in ONNX's format")
-    check_regular(path)
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads
+    # Said, because onnxruntime would otherwise pin threads to processors that may not be this process's.
+    options.intra_op_num_threads = threads or cv2.getNumberOfCPUs()
     options.log_severity_level = 3  # errors are raised; of the rest it says much
     there = onnxruntime.get_available_providers()
     try:
@@ -154,12 +153,13 @@ def _labels(
 ) -> Int[np.ndarray, "h w"]:
     """Return a class for each pixel of an image of (width, height). Raises ValueError for an answer that is none."""
     count, shape, kind = classes.count, answer.shape, answer.dtype.kind
-    if shape[0] == 1 and answer.size and kind == "f" and answer.ndim == 4 and count in (shape[1], shape[3]):
+    one = answer.ndim in (3, 4) and shape[0] == 1 and answer.size > 0
+    if one and kind == "f" and answer.ndim == 4 and count in (shape[1], shape[3]):
         scores = answer[0] if shape[1] == count else answer[0].transpose(2, 0, 1)
         if not np.isfinite(scores).all():
             raise ValueError(f"{path} answers with scores that are not finite: export it as float32")
         return _best(scores, size)
-    if shape[0] == 1 and answer.size and kind in "iu" and (answer.ndim == 3 or 1 in (shape[1], shape[-1])):
+    if one and kind in "iu" and (answer.ndim == 3 or 1 in (shape[1], shape[3])):
         labels = answer.reshape(shape[2:] if answer.ndim == 4 and shape[1] == 1 else shape[1:3])
         if labels.min() >= 0 and labels.max() < count:
             # The pixel in whose area the center lies.

@@ -100,6 +100,8 @@ def fixed_answer(path: Path, values: np.ndarray) -> Path:
         (np.zeros((2, 4, 2, 2), np.float32), r"float32, \(2, 4, 2, 2\)"),
         (np.zeros((1, 100, 5), np.float32), r"float32, \(1, 100, 5\)"),
         (np.zeros((1, 4, 0, 2), np.float32), r"\(1, 4, 0, 2\)"),
+        (np.zeros((1, 1), np.int64), r"int64, \(1, 1\)"),
+        (np.zeros((), np.int64), r"int64, \(\)"),
         (np.zeros((1, 4, 2, 2), np.int64), r"int64, \(1, 4, 2, 2\)"),
         (np.full((1, 2, 2), 4), "classes 4 to 4, and .* from 0 to 3: say its classes="),
         (np.full((1, 2, 2), -1), "classes -1 to -1"),

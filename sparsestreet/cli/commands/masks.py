@@ -38,7 +38,7 @@ class MaskOptions:
 
     def __post_init__(self) -> None:
         if self.threads < 0:
-            raise ValueError(f"threads must be 0 or more, got {self.threads}: leave it out for onnxruntime's choice")
+            raise ValueError(f"threads must be 0 or more, got {self.threads}: leave it out for all processors")
 
 
 def masks(arguments: Sequence[str]) -> int:
