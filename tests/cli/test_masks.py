@@ -1,6 +1,7 @@
 """``data masks``: from the images of a log to masks that its reader takes."""
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -143,6 +144,14 @@ def test_a_command_that_failed_binds_nothing(street, tmp_path):
     words = words_of(street[0], tmp_path / "out")
     assert masked([words[0], words[1], "classes=coco", words[3]]) == 2
     assert masked(words) == 0
+
+
+def test_without_onnxruntime_the_remedy_is_said(street, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    assert masked(words_of(street[0], tmp_path / "out")) == 2
+    assert (
+        "sparsestreet data masks: masks need onnxruntime: pip install 'sparsestreet[masks]'" in capsys.readouterr().err
+    )
 
 
 def test_each_kind_has_its_color():
