@@ -125,6 +125,7 @@ def test_after_ctrl_c_the_same_command_goes_on(street, tmp_path, capsys, monkeyp
         (["{log}", "model={model}", "classes=coco", "std=1"], "mean and std must be 3 numbers each"),
         (["{log}", "model={model}", "classes=coco", "threads=-1"], "threads must be 0 or more"),
         (["{log}", "model={model}", "classes=coco", "layers=3"], "no key 'layers'"),
+        (["{log}", "out=there", "model={model}", "classes=coco"], "out= is of trainings: say to=there for the folder"),
         (["{log}", "{log}", "model={model}", "classes=coco"], "masks are of one recorded log at a time"),
         (["model={model}", "classes=coco"], "say sparsestreet data masks DIR model=FILE classes=cityscapes"),
         (["data=synthetic", "model={model}", "classes=coco"], "StreetReader takes no folder of masks"),

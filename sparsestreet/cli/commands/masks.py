@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sparsestreet.cli.commands.options import parse_options, shown
-from sparsestreet.cli.config.log_from_options import UsageError, configured_log, reader_of
+from sparsestreet.cli.config.log_from_options import configured_log, reader_of, without_folder
 
 if TYPE_CHECKING:
     from jaxtyping import Bool, UInt8
@@ -45,15 +45,13 @@ def masks(arguments: Sequence[str]) -> int:
     """Write, print and draw. Raises UsageError and OptionError for words that cannot be followed."""
     from sparsestreet.segmentation.model import Preparation
 
-    folders = [text for text in arguments if "=" not in text and not text.startswith("-")]
-    if len(folders) > 1:
-        raise UsageError(f"{ONE_LOG}, got {' '.join(folders)}")
+    words, folder = without_folder(arguments, ONE_LOG)
     own, seen = (
-        [text for text in arguments if text.partition("=")[0] in _keys(kind)] for kind in (MaskOptions, Preparation)
+        [text for text in words if text.partition("=")[0] in _keys(kind)] for kind in (MaskOptions, Preparation)
     )
     options, preparation = parse_options(own, MaskOptions), parse_options(seen, Preparation)
-    words = [text for text in arguments if text not in (*own, *seen, *folders)]
-    cfg, told = configured_log(words, Path(folders[0]) if folders else None, no_log=NO_LOG, one_log=ONE_LOG)
+    words = [text for text in words if text not in (*own, *seen)]
+    cfg, told = configured_log(words, folder, no_log=NO_LOG, one_log=ONE_LOG)
     if told:
         print(told)
     try:
@@ -77,7 +75,7 @@ def _lines(cfg: "DictConfig", options: MaskOptions, preparation: "Preparation") 
     from sparsestreet.segmentation.write import LogImages, write_masks
 
     classes = segmentation_classes(options.classes)
-    segmenter = Segmenter(options.model.expanduser(), classes, preparation, options.threads)
+    segmenter = Segmenter(options.model, classes, preparation, options.threads)
     log = LogImages.of(reader_of(cfg), tuple(classes.kinds))
     out = Path("outputs/masks") / log.name if options.to is None else options.to
     yield f"{log.name}: {len(log)} images by {options.model.name} on {segmenter.provider}; {classes}"
