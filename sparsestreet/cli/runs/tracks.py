@@ -17,6 +17,7 @@ from sparsestreet.naming import one_line
 from sparsestreet.records.strict_json import EXACT, RecordError, json_line, read_json, version, write_atomically
 from sparsestreet.scene.edits.edits import objects_of
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.tracking.bodies import with_bodies
 from sparsestreet.tracking.objects import Kind
 from sparsestreet.tracking.settings import TrackingSettings
 from sparsestreet.tracking.street import found_tracks, joined
@@ -26,13 +27,29 @@ _log = logging.getLogger(__name__)
 
 
 def with_tracks(cfg: DictConfig, log: DrivingLog, run: Path | None = None) -> DrivingLog:
-    """The log with the objects that the configuration asks for (conf/tracks).
+    """The log with the objects that the configuration asks for (conf/tracks), and their bodies.
 
     ``run``: a run that has begun, whose found objects are taken if it has kept any; None: they are found.
 
-    Raises ValueError where they are to be found, and there is no lidar, or a kind of them has no class; and for a run
-    whose file is damaged, or not of this log.
+    Raises ValueError where they are to be found, and there is no lidar, or a kind of them has no class; for a run
+    whose file is damaged, or not of this log; and for bodies that are neither fitted nor null.
     """
+    boxed, bodies = _with_boxes(cfg, log, run), (cfg.get("tracks") or {}).get("bodies")
+    if bodies not in (None, "fitted"):
+        raise ValueError(f"tracks.bodies is fitted or null, got {bodies!r}")
+    if bodies is None:
+        return boxed
+    # A run has the fitted bodies in its scene and its checkpoints: fitted anew, they only say who has one.
+    classes = {name for node in cfg.node.values() if node.get("has_body_pose") for name in node.get("classes") or ()}
+    return with_bodies(boxed, _held_out(cfg, log), classes)
+
+
+def _held_out(cfg: DictConfig, log: DrivingLog) -> frozenset[int]:
+    parts = split(log, stride=cfg.split.stride, offset=cfg.split.offset, cameras=cfg.split.cameras)
+    return parts.held_out_indices
+
+
+def _with_boxes(cfg: DictConfig, log: DrivingLog, run: Path | None) -> DrivingLog:
     asked = cfg.get("tracks") or {"name": "log"}  # runs of earlier versions do not say
     if asked["name"] == "none":
         return log.with_tracks(())
@@ -48,8 +65,7 @@ def with_tracks(cfg: DictConfig, log: DrivingLog, run: Path | None = None) -> Dr
     if run is not None and (run / TRACKS_FILE).exists():
         return log.with_tracks((*own, *read_tracks(run, log)))
     settings = instantiate(asked["settings"]) if "settings" in asked else TrackingSettings()
-    parts = split(log, stride=cfg.split.stride, offset=cfg.split.offset, cameras=cfg.split.cameras)
-    return log.with_tracks(joined(own, found_tracks(log, settings, parts.held_out_indices, found_classes(cfg))))
+    return log.with_tracks(joined(own, found_tracks(log, settings, _held_out(cfg, log), found_classes(cfg))))
 
 
 def finds(cfg: DictConfig, log: DrivingLog) -> bool:
