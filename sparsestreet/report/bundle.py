@@ -11,6 +11,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from importlib import metadata
+from io import BufferedIOBase
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO
@@ -184,7 +185,7 @@ def _listed(folder: Path) -> BundledRun:
     return BundledRun(**{field.name: getattr(run, field.name) for field in fields(BundledRun)[:-1]}, files=files)
 
 
-def digest(file: IO[bytes]) -> str:
+def digest(file: IO[bytes] | BufferedIOBase) -> str:
     """Return the SHA-256 of what is left of a file, which is closed, in hexadecimal digits."""
     found = hashlib.sha256()
     with file:

@@ -16,7 +16,7 @@ from sparsestreet.cli.config.validate import config_problem, override_problem
 from sparsestreet.cli.runs.folder import CONFIGURATION, TRACKS_FILE, received_words, without_environment
 from sparsestreet.metrics.definitions import PROTOCOLS
 from sparsestreet.naming import one_line, printable
-from sparsestreet.records.configuration import IDENTITY_KEYS, Configuration, Setting, flat_config, only, without
+from sparsestreet.records.configuration import IDENTITY_KEYS, config_hash, flat_config, only, without
 from sparsestreet.records.run import RUN, RunDescription, this_source
 from sparsestreet.records.summary import SUMMARY, RunSummary
 from sparsestreet.report.bundle import SCENE
@@ -38,6 +38,9 @@ names (docs/extending.md).
 
 Exit status: 0 all holds, 1 something does not, 2 wrong usage.
 """
+
+_SEEDS = ("seed", "*.seed")
+"""Options that are no part of a configuration's identity, and yet of a run's."""
 
 
 @dataclass(frozen=True)
@@ -139,20 +142,17 @@ def _configuration(words: list[str], run: RunDescription, source: Path) -> DictC
     cfg = with_images(composed(words), images if isinstance(images, int) else None)
     if problem := config_problem(cfg):
         raise ValueError(f"{source}: {problem}")
-    here, there = (_identity(config) for config in (flat_config(resolved(cfg)), run.config))
-    keys = [key for key in sorted(here.keys() | there.keys()) if here.get(key) != there.get(key)]
-    if not keys:
+    ours = flat_config(resolved(cfg))
+    here, there = ({**without(config, IDENTITY_KEYS), **only(config, _SEEDS)} for config in (ours, run.config))
+    if config_hash(ours) == run.config_hash and only(here, _SEEDS) == only(there, _SEEDS):
         return cfg
+    keys = [key for key in sorted(here.keys() | there.keys()) if here.get(key) != there.get(key)]
     said = ", ".join(
         f"{one_line(key)} ({one_line(str(there.get(key)))} in the record, {one_line(str(here.get(key)))} here)"
         for key in keys[:3]
     )
     commit = one_line(str(run.source.commit))[:9]
     raise ValueError(f"{source} is configured otherwise here, in {len(keys)} options: {said}; take commit {commit}")
-
-
-def _identity(config: Configuration) -> dict[str, Setting]:
-    return {**without(config, IDENTITY_KEYS), **only(config, ("seed", "*.seed"))}
 
 
 def _check_data(cfg: DictConfig, run: RunDescription, source: Path) -> None:
