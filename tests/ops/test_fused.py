@@ -8,7 +8,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops import backend as fused
 from sparsestreet.ops.activate import activate
-from sparsestreet.ops.adam import AdamStep, adam_rows_
+from sparsestreet.ops.adam import AdamStep, adam_all_
 from sparsestreet.ops.backend import fused_backend
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import RawGaussians
@@ -24,12 +24,8 @@ TRACKS = Trajectories(
 IMAGE = torch.zeros(11, 11, 3)
 CAMERA = Camera(torch.eye(4), torch.eye(3), width=11, height=11)
 STEPS = {
-    "adam": lambda backend: adam_rows_(
-        *(torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 3)),
-        torch.zeros(2).long(),
-        AdamStep(1, 0.1),
-        width=3,
-        backend=backend,
+    "adam": lambda backend: adam_all_(
+        [MEANS], [MEANS], [MEANS], [MEANS], torch.zeros(1, 2).long(), [AdamStep(1, 0.1)], [3], backend=backend
     ),
     "activate": lambda backend: activate([ROWS], sh_degree=0, backend=backend),
     "poses": lambda backend: poses_at(TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend),
@@ -39,7 +35,7 @@ STEPS = {
     "ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
 }
 PLACES = {
-    "adam": {"cpu": "adam._step_in_library_", "triton": "triton.adam.step_finite_rows_"},
+    "adam": {"cpu": "adam._step_in_library_", "triton": "triton.adam.AdamTables.launch"},
     "activate": {"cpu": "cpu.rows.activate", "triton": "triton.activate.activate"},
     "poses": {"cpu": "cpu.rows.poses_at", "triton": "triton.poses.poses_at"},
     "sky": {"cpu": "cpu.images.over_sky", "triton": "triton.sky.over_sky"},

@@ -14,7 +14,7 @@ from torch import Tensor
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, to measure and test it."""
-_INTERFACE_VERSION = 17
+_INTERFACE_VERSION = 18
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -105,7 +105,6 @@ class CAdamRows(ctypes.Structure):
         *((name, c_int64) for name in ("rows", "width")),
         *((name, c_void_p) for name in ("parameter", "gradient", "exp_avg", "exp_avg_sq")),
         *((name, c_double) for name in ("share", "beta", "square_share", "root", "eps", "size")),
-        ("threads", c_int64),
         ("refused", c_void_p),
     )
 
@@ -220,7 +219,7 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_activate_backward": (c_int32, (c_int32, c_int32, c_void_p, c_void_p, c_void_p)),
         "splat_poses": (None, (c_int32, c_int32, c_void_p, c_void_p)),
         "splat_poses_backward": (None, (c_int32, c_int32, c_int64, *(c_void_p,) * 5)),
-        "splat_adam": (None, (c_int32, c_int32, c_void_p)),
+        "splat_adam": (None, (c_int32, c_int32, c_void_p, c_int64, c_int64)),
         "splat_ssim": (c_int32, (c_int32, c_int32, *(c_void_p,) * 3)),
         "splat_ssim_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
     }

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 17;
+constexpr int32_t INTERFACE_VERSION = 18;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -154,7 +154,6 @@ struct AdamRows {
   const void* gradient;
   void *exp_avg, *exp_avg_sq;
   double share, beta, square_share, root, eps, size;
-  int64_t threads;
   int64_t* refused;  // number of rows whose gradient is not finite, and the first of them
 };
 

@@ -40,7 +40,7 @@ struct NodeKernels {
 };
 
 struct AdamKernels {
-  void (*step)(const AdamRows&);
+  void (*step)(const AdamRows* tables, int64_t count, int64_t threads);
 };
 
 struct SimilarityKernels {

@@ -208,8 +208,8 @@ SPLAT_API void splat_poses_backward(int32_t is_double, int32_t index, int64_t in
                                                 translation_deltas);
 }
 
-SPLAT_API void splat_adam(int32_t is_double, int32_t index, const AdamRows* rows) {
-  chosen(index).adam[is_double].step(*rows);
+SPLAT_API void splat_adam(int32_t is_double, int32_t index, const AdamRows* tables, int64_t count, int64_t threads) {
+  chosen(index).adam[is_double].step(tables, count, threads);
 }
 
 // Mean similarity, and its partial derivatives unless `partials` is null.
