@@ -14,6 +14,7 @@ from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
+from sparsestreet.ops.statistics import add_view_
 from sparsestreet.types import Camera
 
 MEANS, SCALES, TURNS, OPACITIES, DC, REST = (torch.zeros(1, *shape) for shape in ((3,), (3,), (4,), (), (1, 3), (0, 3)))
@@ -33,12 +34,16 @@ STEPS = {
         IMAGE, IMAGE[..., 0], torch.zeros(6, 1, 1, 3), CAMERA, transmittance_min=0.1, backend=backend
     ),
     "ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
+    "statistics": lambda backend: add_view_(
+        OPACITIES, OPACITIES.long(), OPACITIES, MEANS[:, :2], OPACITIES, (2, 2), backend=backend
+    ),
 }
 PLACES = {
     "adam": {"cpu": "adam._step_in_library_", "triton": "triton.adam.AdamTables.launch"},
     "activate": {"cpu": "cpu.rows.activate", "triton": "triton.activate.activate"},
     "poses": {"cpu": "cpu.rows.poses_at", "triton": "triton.poses.poses_at"},
     "sky": {"cpu": "cpu.images.over_sky", "triton": "triton.sky.over_sky"},
+    "statistics": {"cpu": "statistics._add_in_library_", "triton": "triton.statistics.add_view_"},
     "ssim": {"cpu": "cpu.images.mean_ssim", "triton": "triton.ssim.mean_ssim"},
 }
 """Where each implementation lies in sparsestreet.ops."""

@@ -109,6 +109,17 @@ class CAdamRows(ctypes.Structure):
     )
 
 
+class CScreenView(ctypes.Structure):
+    """What a view shows of each row, and the size of its image."""
+
+    _fields_ = (
+        ("rows", c_int64),
+        *((name, c_void_p) for name in ("gradient", "radii")),
+        *((name, c_double) for name in ("half_width", "half_height", "longer")),
+        *((name, c_int64) for name in ("visits_all", "threads")),
+    )
+
+
 class CImagePair(ctypes.Structure):
     """Pointers to two images, and the definition of their structural similarity."""
 
@@ -220,6 +231,7 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_poses": (None, (c_int32, c_int32, c_void_p, c_void_p)),
         "splat_poses_backward": (None, (c_int32, c_int32, c_int64, *(c_void_p,) * 5)),
         "splat_adam": (None, (c_int32, c_int32, c_void_p, c_int64, c_int64)),
+        "splat_statistics": (None, (c_int32, c_int32, c_void_p, c_void_p)),
         "splat_ssim": (c_int32, (c_int32, c_int32, *(c_void_p,) * 3)),
         "splat_ssim_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
     }

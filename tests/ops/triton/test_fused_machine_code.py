@@ -10,11 +10,13 @@ from sparsestreet.ops.adam import AdamStep, adam_all_, adam_step_
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
+from sparsestreet.ops.statistics import add_view_
 from sparsestreet.ops.triton import activate as fused_activate
 from sparsestreet.ops.triton import adam
 from sparsestreet.ops.triton import poses as fused_poses
 from sparsestreet.ops.triton import sky as fused_sky
 from sparsestreet.ops.triton import ssim as fused_ssim
+from sparsestreet.ops.triton import statistics as fused_statistics
 from tests.ops.scenes import camera, device_of
 from tests.ops.test_activate import case
 from tests.ops.test_activate import values_and_gradients as activated
@@ -28,7 +30,7 @@ DEVICE = device_of("triton")
 # their way at once; of poses there is a warp or two.
 REGISTERS = {
     "activate_rows": 64, "activate_rows_backward": 96, "interpolate": 41, "interpolate_backward": 64,
-    "step_numbers": 32, "step_tables": 64,
+    "step_numbers": 32, "step_tables": 64, "add_rows": 32,
     "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64,
 }  # fmt: skip
 # Where the sine of an angle above 1e5 would be reduced.
@@ -38,7 +40,9 @@ STACK = {"interpolate": 32, "interpolate_backward": 32}
 @pytest.fixture(scope="module", params=[80, 90], ids=["sm_80", "sm_90"])
 def compiled(request) -> list[tuple[Launch, dict]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        launches = record_launches(monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim))
+        launches = record_launches(
+            monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim, fused_statistics)
+        )
         launch_nodes()
         launch_images()
         for shape in ((2, 15, 3), (2, 3)):
@@ -60,6 +64,8 @@ def launch_nodes() -> None:
     for rest, degree, every in ((15, 3, True), (0, 0, False)):
         rows = case(rest, every, every, 2, torch.float32, DEVICE)
         activated(rows, lambda parts, degree=degree: activate(parts, sh_degree=degree, backend="triton"))
+    row = torch.zeros(1, device=DEVICE)
+    add_view_(row, row.long(), row, row.expand(1, 2), row, (2, 2), watched=[(row, row)], backend="triton")
     table, deltas = on_device("triton", torch.float32)
     poses_at(table, *deltas, 0.3, MAX_GAP, backend="triton").translations.sum().backward()
 
@@ -86,7 +92,7 @@ def test_every_kernel_is_compiled(compiled):
         "activate_rows", "activate_rows_backward", "lay_over_sky", "lay_over_sky_backward", "step_numbers",
         "step_tables",
     ]  # fmt: skip
-    of_one = ["interpolate", "interpolate_backward", "similarity", "similarity", "similarity_backward"]
+    of_one = ["add_rows", "interpolate", "interpolate_backward", "similarity", "similarity", "similarity_backward"]
     expected = [*of_one, *of_two_sizes * 2]
     assert sorted(launch.name for launch, _ in compiled) == sorted(expected)
 

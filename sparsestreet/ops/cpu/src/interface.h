@@ -157,6 +157,22 @@ struct AdamRows {
   int64_t* refused;  // number of rows whose gradient is not finite, and the first of them
 };
 
+// What a view shows of each row: [rows, 2] gradients per pixel, and radii; half the sides of the image, and the longer.
+struct ScreenView {
+  int64_t rows;
+  const void *gradient, *radii;
+  double half_width, half_height, longer;
+  int64_t visits_all, threads;
+};
+
+// Sums over views that take it in. Null: the three that all nodes have, or the watched column.
+struct RowStatistics {
+  void* gradient_sum;
+  int64_t* visits;
+  void *largest_screen, *watched_sum;
+  const void* watched;
+};
+
 enum Stage { PROJECT, BIN, BLEND, BLEND_BACKWARD, PROJECT_BACKWARD, COUNT, STAGES };
 
 }  // namespace splat

@@ -43,6 +43,10 @@ struct AdamKernels {
   void (*step)(const AdamRows* tables, int64_t count, int64_t threads);
 };
 
+struct StatisticsKernels {
+  void (*add)(const ScreenView&, const RowStatistics&);
+};
+
 struct SimilarityKernels {
   void (*forward)(const ImagePair&, void* partials, void* mean);
   void (*backward)(const ImagePair&, void* partials, const void* v_mean, void* v_image);
@@ -55,6 +59,7 @@ struct Kernels {
   SkyKernels sky[2];
   NodeKernels nodes[2];
   AdamKernels adam[2];
+  StatisticsKernels statistics[2];
   SimilarityKernels similarity[2];
 };
 

@@ -212,6 +212,10 @@ SPLAT_API void splat_adam(int32_t is_double, int32_t index, const AdamRows* tabl
   chosen(index).adam[is_double].step(tables, count, threads);
 }
 
+SPLAT_API void splat_statistics(int32_t is_double, int32_t index, const ScreenView* view, const RowStatistics* into) {
+  chosen(index).statistics[is_double].add(*view, *into);
+}
+
 // Mean similarity, and its partial derivatives unless `partials` is null.
 SPLAT_API int32_t splat_ssim(int32_t is_double, int32_t index, const ImagePair* pair, void* partials, void* mean) {
   return guarded([&]() -> int32_t { return chosen(index).similarity[is_double].forward(*pair, partials, mean), OK; });
