@@ -10,6 +10,7 @@ from torch import Tensor
 from sparsestreet.data.images import WHITE
 from sparsestreet.ops import splat
 from sparsestreet.ops.activate import activate
+from sparsestreet.ops.pixel_losses import depth_error, sky_entropy
 from sparsestreet.ops.ssim import ssim
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
@@ -107,11 +108,7 @@ class SkyMask(Loss):
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         assert frame.sky is not None  # it applies
-        right = torch.where(frame.sky, 1 - rendering.alpha, rendering.alpha)
-        if self.floor is not None:
-            # The value of the clamped number with the gradient of the number itself.
-            right = right + (self.floor - right.detach()).relu()
-        return -self.weight * ((right + self.eps) / (1 + self.eps)).log().mean()
+        return sky_entropy(rendering.alpha, frame.sky, weight=self.weight, eps=self.eps, floor=self.floor)
 
 
 @dataclass(frozen=True)
@@ -132,13 +129,11 @@ class Depth(Loss):
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         assert frame.depth is not None  # it applies
-        measured, rendered = frame.depth, rendering.depth
         least = self.nearest if self.nearest_rendered is None else self.nearest_rendered
-        valid = (measured > self.nearest) & (measured < self.farthest) & (rendered > least)
-        # Over all pixels, because picking the valid ones would wait for a device; 1 m stands where none is.
-        rendered, measured = torch.where(valid, rendered, 1.0), torch.where(valid, measured, 1.0)
-        error = 1 / rendered - 1 / measured if self.inverse else rendered - measured
-        return self.weight * (error.abs().sum() / valid.sum().clamp(min=1))
+        return depth_error(
+            rendering.depth, frame.depth, weight=self.weight, nearest=self.nearest, farthest=self.farthest,
+            nearest_rendered=least, inverse=self.inverse,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -120,6 +120,17 @@ class CScreenView(ctypes.Structure):
     )
 
 
+class CPixelTerm(ctypes.Structure):
+    """A loss that is a mean over pixels."""
+
+    _fields_ = (
+        *((name, c_int64) for name in ("kind", "pixels")),
+        ("numbers", c_double * 3),
+        ("weight", c_double),
+        ("threads", c_int64),
+    )
+
+
 class CImagePair(ctypes.Structure):
     """Pointers to two images, and the definition of their structural similarity."""
 
@@ -232,6 +243,7 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_poses_backward": (None, (c_int32, c_int32, c_int64, *(c_void_p,) * 5)),
         "splat_adam": (None, (c_int32, c_int32, c_void_p, c_int64, c_int64)),
         "splat_statistics": (None, (c_int32, c_int32, c_void_p, c_void_p)),
+        "splat_pixel_mean": (c_int32, (c_int32, c_int32, *(c_void_p,) * 6)),
         "splat_ssim": (c_int32, (c_int32, c_int32, *(c_void_p,) * 3)),
         "splat_ssim_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
     }

@@ -7,12 +7,14 @@ import torch
 
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.adam import AdamStep, adam_all_, adam_step_
+from sparsestreet.ops.pixel_losses import depth_error, sky_entropy
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
 from sparsestreet.ops.statistics import add_view_
 from sparsestreet.ops.triton import activate as fused_activate
 from sparsestreet.ops.triton import adam
+from sparsestreet.ops.triton import pixel_losses as fused_losses
 from sparsestreet.ops.triton import poses as fused_poses
 from sparsestreet.ops.triton import sky as fused_sky
 from sparsestreet.ops.triton import ssim as fused_ssim
@@ -25,12 +27,12 @@ from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
 pytestmark = pytest.mark.slow
 DEVICE = device_of("triton")
-# Measured with Triton 3.7.1: 64, 94, 41, 64, 22, 64, 32, 40, 64, 64. A streaming multiprocessor has 65536 registers: at
+# Measured with Triton 3.7.1: 64, 94, 41, 64, 22, 64, 24, 32, 40, 32, 40, 64, 64. A multiprocessor has 65536 registers: at
 # 32 in each lane it holds all the warps it can, at 64 half of them. Rows take many, because 16 coefficients are on
 # their way at once; of poses there is a warp or two.
 REGISTERS = {
     "activate_rows": 64, "activate_rows_backward": 96, "interpolate": 41, "interpolate_backward": 64,
-    "step_numbers": 32, "step_tables": 64, "add_rows": 32,
+    "step_numbers": 32, "step_tables": 64, "add_rows": 32, "sum_pixels": 32, "add_sums": 40,
     "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64,
 }  # fmt: skip
 # Where the sine of an angle above 1e5 would be reduced.
@@ -41,7 +43,7 @@ STACK = {"interpolate": 32, "interpolate_backward": 32}
 def compiled(request) -> list[tuple[Launch, dict]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
         launches = record_launches(
-            monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim, fused_statistics)
+            monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim, fused_statistics, fused_losses)
         )
         launch_nodes()
         launch_images()
@@ -81,6 +83,9 @@ def launch_all_parameters() -> None:
 def launch_images() -> None:
     image = torch.zeros(11, 11, 3, device=DEVICE)
     ssim(image, image, backend="triton")
+    plane = image[..., 0].contiguous().requires_grad_()
+    depth_error(plane, plane, backend="triton")
+    sky_entropy(plane, plane > 0, backend="triton")
     ssim(image.requires_grad_(), image, backend="triton").backward()
     texels = torch.zeros(6, 2, 2, 3, device=DEVICE)
     for view in (replace(camera(11, 11), distortion=torch.zeros(5)), camera(11, 11)):
@@ -92,7 +97,15 @@ def test_every_kernel_is_compiled(compiled):
         "activate_rows", "activate_rows_backward", "lay_over_sky", "lay_over_sky_backward", "step_numbers",
         "step_tables",
     ]  # fmt: skip
-    of_one = ["add_rows", "interpolate", "interpolate_backward", "similarity", "similarity", "similarity_backward"]
+    of_one = [
+        "add_rows",
+        *["sum_pixels", "add_sums"] * 2,
+        "interpolate",
+        "interpolate_backward",
+        "similarity",
+        "similarity",
+        "similarity_backward",
+    ]
     expected = [*of_one, *of_two_sizes * 2]
     assert sorted(launch.name for launch, _ in compiled) == sorted(expected)
 

@@ -173,6 +173,16 @@ struct RowStatistics {
   const void* watched;
 };
 
+// Kinds of losses that are a mean over pixels, and their numbers: of depths the nearest and farthest return and the
+// nearest rendered depth, of a sky epsilon and the floor.
+enum PixelKind { DEPTH, INVERSE_DEPTH, SKY };
+
+struct PixelTerm {
+  int64_t kind, pixels;
+  double numbers[3], weight;
+  int64_t threads;
+};
+
 enum Stage { PROJECT, BIN, BLEND, BLEND_BACKWARD, PROJECT_BACKWARD, COUNT, STAGES };
 
 }  // namespace splat

@@ -31,6 +31,10 @@ struct SkyKernels {
   void (*backward)(const Sky&, const void* alpha, const void* v_out, void* v_alpha, void* v_texels);
 };
 
+struct LossKernels {
+  void (*mean)(const PixelTerm&, const void* predicted, const void* truth, void* slopes, void* mean, void* share);
+};
+
 struct NodeKernels {
   void (*activate)(const RawRows&, const ActiveRows&);
   void (*activate_backward)(const RawRows&, const ActiveRows& cotangents, const RawGradients&);
@@ -57,6 +61,7 @@ struct Kernels {
   RowKernels rows[2];      // float, double
   PixelKernels pixels[2];
   SkyKernels sky[2];
+  LossKernels losses[2];
   NodeKernels nodes[2];
   AdamKernels adam[2];
   StatisticsKernels statistics[2];

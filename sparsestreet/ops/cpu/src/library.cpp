@@ -216,6 +216,14 @@ SPLAT_API void splat_statistics(int32_t is_double, int32_t index, const ScreenVi
   chosen(index).statistics[is_double].add(*view, *into);
 }
 
+// A weighted mean over pixels, the share of each in it, and unless `slopes` is null the derivative of each.
+SPLAT_API int32_t splat_pixel_mean(int32_t is_double, int32_t index, const PixelTerm* term, const void* predicted,
+                                   const void* truth, void* slopes, void* mean, void* share) {
+  return guarded([&]() -> int32_t {
+    return chosen(index).losses[is_double].mean(*term, predicted, truth, slopes, mean, share), OK;
+  });
+}
+
 // Mean similarity, and its partial derivatives unless `partials` is null.
 SPLAT_API int32_t splat_ssim(int32_t is_double, int32_t index, const ImagePair* pair, void* partials, void* mean) {
   return guarded([&]() -> int32_t { return chosen(index).similarity[is_double].forward(*pair, partials, mean), OK; });
