@@ -10,8 +10,8 @@ from torch import Tensor
 from sparsestreet.data.images import WHITE
 from sparsestreet.ops import splat
 from sparsestreet.ops.activate import activate
+from sparsestreet.ops.photometric import photometric
 from sparsestreet.ops.pixel_losses import depth_error, sky_entropy
-from sparsestreet.ops.ssim import ssim
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
@@ -42,13 +42,9 @@ class Photometric(Loss):
     """Level of 255 from which a recorded channel is a lower bound; None: none is (DriveStudio's loss)."""
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
-        rgb, truth = rendering.rgb, frame.image.to(rendering.rgb.dtype) / 255
-        if self.white is not None:
-            rgb = torch.where(frame.image >= self.white, torch.minimum(rgb, truth), rgb)
-        error = (rgb - truth).abs().mean()
-        if self.lambda_dssim > 0:
-            error = (1 - self.lambda_dssim) * error + self.lambda_dssim * (1 - ssim(rgb, truth))
-        return self.weight * error
+        return photometric(
+            rendering.rgb, frame.image, lambda_dssim=self.lambda_dssim, white=self.white, weight=self.weight
+        )
 
 
 def without_hood(rendering: SceneRendering, frame: Frame) -> tuple[SceneRendering, Frame]:

@@ -10,6 +10,7 @@ from sparsestreet.ops import backend as fused
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.adam import AdamStep, adam_all_
 from sparsestreet.ops.backend import fused_backend
+from sparsestreet.ops.photometric import photometric
 from sparsestreet.ops.pixel_losses import depth_error, sky_entropy
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import RawGaussians
@@ -35,6 +36,7 @@ STEPS = {
         IMAGE, IMAGE[..., 0], torch.zeros(6, 1, 1, 3), CAMERA, transmittance_min=0.1, backend=backend
     ),
     "ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
+    "photometric": lambda backend: photometric(IMAGE, IMAGE.to(torch.uint8), lambda_dssim=0.2, backend=backend),
     "depth": lambda backend: depth_error(IMAGE[..., 0], IMAGE[..., 0], backend=backend),
     "alpha": lambda backend: sky_entropy(IMAGE[..., 0], IMAGE[..., 0].bool(), backend=backend),
     "statistics": lambda backend: add_view_(
@@ -47,6 +49,7 @@ PLACES = {
     "poses": {"cpu": "cpu.rows.poses_at", "triton": "triton.poses.poses_at"},
     "sky": {"cpu": "cpu.images.over_sky", "triton": "triton.sky.over_sky"},
     "statistics": {"cpu": "statistics._add_in_library_", "triton": "triton.statistics.add_view_"},
+    "photometric": {"cpu": "cpu.images.compare", "triton": "triton.photometric.compare"},
     "depth": {"cpu": "pixel_losses._mean_in_library_", "triton": "triton.pixel_losses.mean_of_"},
     "alpha": {"cpu": "pixel_losses._mean_in_library_", "triton": "triton.pixel_losses.mean_of_"},
     "ssim": {"cpu": "cpu.images.mean_ssim", "triton": "triton.ssim.mean_ssim"},

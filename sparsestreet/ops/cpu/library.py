@@ -131,6 +131,17 @@ class CPixelTerm(ctypes.Structure):
     )
 
 
+class CColors(ctypes.Structure):
+    """An image and a recorded one of 8 bits, and what their errors are multiplied by."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("image", "recorded")),
+        *((name, c_int64) for name in ("numbers", "white")),
+        ("scale", c_double),
+        ("threads", c_int64),
+    )
+
+
 class CImagePair(ctypes.Structure):
     """Pointers to two images, and the definition of their structural similarity."""
 
@@ -244,6 +255,8 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_adam": (None, (c_int32, c_int32, c_void_p, c_int64, c_int64)),
         "splat_statistics": (None, (c_int32, c_int32, c_void_p, c_void_p)),
         "splat_pixel_mean": (c_int32, (c_int32, c_int32, *(c_void_p,) * 6)),
+        "splat_colors": (c_int32, (c_int32, c_int32, *(c_void_p,) * 4)),
+        "splat_colors_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
         "splat_ssim": (c_int32, (c_int32, c_int32, *(c_void_p,) * 3)),
         "splat_ssim_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
     }

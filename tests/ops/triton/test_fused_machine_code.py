@@ -7,6 +7,7 @@ import torch
 
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.adam import AdamStep, adam_all_, adam_step_
+from sparsestreet.ops.photometric import photometric
 from sparsestreet.ops.pixel_losses import depth_error, sky_entropy
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.sky import over_sky
@@ -14,6 +15,7 @@ from sparsestreet.ops.ssim import ssim
 from sparsestreet.ops.statistics import add_view_
 from sparsestreet.ops.triton import activate as fused_activate
 from sparsestreet.ops.triton import adam
+from sparsestreet.ops.triton import photometric as fused_photometric
 from sparsestreet.ops.triton import pixel_losses as fused_losses
 from sparsestreet.ops.triton import poses as fused_poses
 from sparsestreet.ops.triton import sky as fused_sky
@@ -27,24 +29,28 @@ from tests.ops.triton.recording import Launch, compile_launches, record_launches
 
 pytestmark = pytest.mark.slow
 DEVICE = device_of("triton")
-# Measured with Triton 3.7.1: 64, 94, 41, 64, 22, 64, 24, 32, 40, 32, 40, 64, 64. A multiprocessor has 65536 registers: at
-# 32 in each lane it holds all the warps it can, at 64 half of them. Rows take many, because 16 coefficients are on
+# Measured with Triton 3.7.1: 64, 94, 41, 64, 22, 64, 24, 32, 40, 32, 40, 64, 64. A multiprocessor has 65536 registers:
+# at 32 in each lane it holds all the warps it can, at 64 half of them. Rows take many, because 16 coefficients are on
 # their way at once; of poses there is a warp or two.
 REGISTERS = {
     "activate_rows": 64, "activate_rows_backward": 96, "interpolate": 41, "interpolate_backward": 64,
     "step_numbers": 32, "step_tables": 64, "add_rows": 32, "sum_pixels": 32, "add_sums": 40,
+    "compare_colors": 32, "add_terms": 40, "compare_colors_backward": 32,
     "lay_over_sky": 32, "lay_over_sky_backward": 40, "similarity": 64, "similarity_backward": 64,
 }  # fmt: skip
 # Where the sine of an angle above 1e5 would be reduced.
 STACK = {"interpolate": 32, "interpolate_backward": 32}
 
 
+MODULES = (
+    fused_activate, fused_poses, adam, fused_sky, fused_ssim, fused_statistics, fused_losses, fused_photometric,
+)  # fmt: skip
+
+
 @pytest.fixture(scope="module", params=[80, 90], ids=["sm_80", "sm_90"])
 def compiled(request) -> list[tuple[Launch, dict]]:
     with pytest.MonkeyPatch.context() as monkeypatch:
-        launches = record_launches(
-            monkeypatch, (fused_activate, fused_poses, adam, fused_sky, fused_ssim, fused_statistics, fused_losses)
-        )
+        launches = record_launches(monkeypatch, MODULES)
         launch_nodes()
         launch_images()
         for shape in ((2, 15, 3), (2, 3)):
@@ -87,6 +93,7 @@ def launch_images() -> None:
     depth_error(plane, plane, backend="triton")
     sky_entropy(plane, plane > 0, backend="triton")
     ssim(image.requires_grad_(), image, backend="triton").backward()
+    photometric(image, image.to(torch.uint8), lambda_dssim=0.2, backend="triton").backward()
     texels = torch.zeros(6, 2, 2, 3, device=DEVICE)
     for view in (replace(camera(11, 11), distortion=torch.zeros(5)), camera(11, 11)):
         over_sky(image, image[..., 0], texels, view, transmittance_min=0.1, backend="triton").sum().backward()
@@ -98,14 +105,9 @@ def test_every_kernel_is_compiled(compiled):
         "step_tables",
     ]  # fmt: skip
     of_one = [
-        "add_rows",
-        *["sum_pixels", "add_sums"] * 2,
-        "interpolate",
-        "interpolate_backward",
-        "similarity",
-        "similarity",
-        "similarity_backward",
-    ]
+        "add_rows", *["sum_pixels", "add_sums"] * 2, "interpolate", "interpolate_backward", *["similarity"] * 3,
+        *["similarity_backward"] * 2, "compare_colors", "add_terms", "compare_colors_backward",
+    ]  # fmt: skip
     expected = [*of_one, *of_two_sizes * 2]
     assert sorted(launch.name for launch, _ in compiled) == sorted(expected)
 

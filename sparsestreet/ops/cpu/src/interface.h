@@ -183,6 +183,16 @@ struct PixelTerm {
   int64_t threads;
 };
 
+// An image and a recorded one of 8 bits; from level `white` on a larger number counts as equal. Errors are summed times
+// `scale`.
+struct Colors {
+  const void* image;
+  const uint8_t* recorded;
+  int64_t numbers, white;
+  double scale;
+  int64_t threads;
+};
+
 enum Stage { PROJECT, BIN, BLEND, BLEND_BACKWARD, PROJECT_BACKWARD, COUNT, STAGES };
 
 }  // namespace splat

@@ -33,6 +33,8 @@ struct SkyKernels {
 
 struct LossKernels {
   void (*mean)(const PixelTerm&, const void* predicted, const void* truth, void* slopes, void* mean, void* share);
+  void (*colors)(const Colors&, void* seen, void* truth, void* error);
+  void (*colors_backward)(const Colors&, const void* truth, const void* v_value, void* v_image);
 };
 
 struct NodeKernels {

@@ -224,6 +224,18 @@ SPLAT_API int32_t splat_pixel_mean(int32_t is_double, int32_t index, const Pixel
   });
 }
 
+// What is compared of both images, and the sum of errors times `scale`.
+SPLAT_API int32_t splat_colors(int32_t is_double, int32_t index, const Colors* colors, void* seen, void* truth,
+                               void* error) {
+  return guarded([&]() -> int32_t { return chosen(index).losses[is_double].colors(*colors, seen, truth, error), OK; });
+}
+
+// Adds the gradient of the errors to `v_image`, and takes both from what does not count.
+SPLAT_API void splat_colors_backward(int32_t is_double, int32_t index, const Colors* colors, const void* truth,
+                                     const void* v_value, void* v_image) {
+  chosen(index).losses[is_double].colors_backward(*colors, truth, v_value, v_image);
+}
+
 // Mean similarity, and its partial derivatives unless `partials` is null.
 SPLAT_API int32_t splat_ssim(int32_t is_double, int32_t index, const ImagePair* pair, void* partials, void* mean) {
   return guarded([&]() -> int32_t { return chosen(index).similarity[is_double].forward(*pair, partials, mean), OK; });

@@ -1,4 +1,5 @@
-// Weighted means over pixels of one number each, and what their gradients need.
+// Weighted means over pixels of one number each, and what their gradients need; errors of colors, and what of both images
+// D-SSIM compares.
 #pragma once
 #include <algorithm>
 #include <cmath>
@@ -73,6 +74,45 @@ void pixel_mean(const splat::PixelTerm& term, const void* predicted, const void*
     over(measured, [](const auto& t, T r, T m) { return depth_number<T, true>(t, r, m); });
   else
     over(static_cast<const uint8_t*>(truth), [](const auto& t, T a, uint8_t s) { return sky_number<T>(t, a, s); });
+}
+
+template <class T>
+void compare_colors(const splat::Colors& colors, void* seen, void* truth, void* error) {
+  const T* image = static_cast<const T*>(colors.image);
+  T *xs = static_cast<T*>(seen), *ys = static_cast<T*>(truth);
+  const int white = int(colors.white);
+  const int64_t blocks = (colors.numbers + BLOCK_PIXELS - 1) / BLOCK_PIXELS;
+  Buffer<double> sums;
+  sums.reserve(blocks);
+#pragma omp parallel for num_threads(colors.threads) schedule(static)
+  for (int64_t block = 0; block < blocks; ++block) {
+    const int64_t end = std::min(colors.numbers, (block + 1) * BLOCK_PIXELS);
+    double sum = 0;
+#pragma omp simd reduction(+ : sum)
+    for (int64_t i = block * BLOCK_PIXELS; i < end; ++i) {
+      const int level = colors.recorded[i];
+      const T y = T(level) / 255, x = (level >= white) & (image[i] > y) ? y : image[i];
+      xs[i] = x, ys[i] = y;
+      sum += std::abs(x - y);
+    }
+    sums[block] = sum;
+  }
+  double sum = 0;
+  for (int64_t block = 0; block < blocks; ++block) sum += sums[block];
+  *static_cast<T*>(error) = T(colors.scale * sum);
+}
+
+template <class T>
+void compare_colors_backward(const splat::Colors& colors, const void* truth, const void* v_value, void* v_image) {
+  const T *image = static_cast<const T*>(colors.image), *ys = static_cast<const T*>(truth);
+  const T pull = T(*static_cast<const T*>(v_value) * colors.scale);
+  T* v = static_cast<T*>(v_image);
+  const int white = int(colors.white);
+#pragma omp parallel for simd num_threads(colors.threads) schedule(static)
+  for (int64_t i = 0; i < colors.numbers; ++i) {
+    const T x = image[i], y = ys[i], moved = v[i] + (x > y ? pull : x < y ? -pull : T(0));
+    v[i] = (colors.recorded[i] >= white) & (x > y) ? T(0) : moved;
+  }
 }
 
 }  // namespace SPLAT_VARIANT

@@ -22,7 +22,8 @@ SkyKernels kernels() {
 
 void fill_sky_kernels(Kernels& k) {
   k.sky[0] = kernels<float>(), k.sky[1] = kernels<double>();
-  k.losses[0] = {pixel_mean<float>}, k.losses[1] = {pixel_mean<double>};
+  k.losses[0] = {pixel_mean<float>, compare_colors<float>, compare_colors_backward<float>};
+  k.losses[1] = {pixel_mean<double>, compare_colors<double>, compare_colors_backward<double>};
 }
 
 }  // namespace SPLAT_VARIANT
