@@ -117,7 +117,8 @@ def test_every_kernel_is_compiled(compiled):
 
 @pytest.mark.slow
 def test_nothing_spills(compiled, request):
-    """But 8 bytes outside of loops, of the forward blend and of rows with harmonics in tables; on sm_120, where registers were not tuned, once in it."""
+    """But 8 bytes outside of loops, of the forward blend and of rows with harmonics in tables; on sm_120, whose
+    registers were not tuned, once in the blend's."""
     newest = "sm_120" in request.node.name
     for launch, found in compiled:
         is_forward = launch.name == "blend_tiles"
