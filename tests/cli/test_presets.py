@@ -64,6 +64,7 @@ ALL = {
     "schedule.refine_in.start": at(501),  # warmup_steps 500, exclusive
     "schedule.refine_in.stop": 1.0,
     "schedule.densify_until": at(14_999),  # stop_split_at 15000, exclusive
+    "schedule.reset_in.start": at(501),  # the same
     "schedule.reset_in.shift": 100,
     "schedule.reset_in.stop": 1.0,
     "schedule.pause_after_reset": None,

@@ -259,7 +259,7 @@ def drivestudio(every: int = 30) -> DensityControl:
 
 
 def test_after_a_reset_every_training_image_comes_first():
-    """DriveStudio's gate: 12 images close the first 12 steps of each 30; nothing is reset at step 2, before it begins."""
+    """DriveStudio's gate: 12 images close the first 12 steps of each 30; none is reset at step 2, before it begins."""
     strategy, listener = AskedStrategy(), Listener()
     system = make_system({"background": background(4, density=strategy)})
     trainer = StubTrainer(system, [control := drivestudio(), listener], train=tuple(map(frame_at, range(12))))
