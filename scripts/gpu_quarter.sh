@@ -25,7 +25,7 @@ HOME_FOLDER="${OUT:-$STAY/home}"
 BUDGET=570       # seconds; the archive, and a training that writes its checkpoint, have what is left of 580
 GSPLAT_UNTIL=260 # what is not compiled then is given up, so that the comparison keeps its time
 # Guesses from records of an H100 and shares of a CPU's time, before any device saw this script.
-declare -A PREDICTED=([parity]=90 [step]=75 [graph]=20 [ours]=90 [theirs]=55 [frames]=25 [train]=150 [export]=20
+declare -A PREDICTED=([parity]=90 [step]=75 [graph]=20 [replay]=45 [ours]=90 [theirs]=55 [frames]=25 [train]=110 [export]=20
   [pruned]=60 [frames2]=25 [street]=40 [export2]=8)
 
 CALL="${1:-}"
@@ -99,11 +99,11 @@ choose_training() {
     { mkdir -p "$STAY/street" && "$PYTHON" -m tarfile -e "$PACK/street.tar.xz" "$STAY/street"; }
 }
 
-run_step() {
-  local options=("out=$OUT/step")
+run_step() { # part, limit in seconds, options of bench step...
+  local options=("out=$OUT/$1" "${@:3}")
   [ "$DRY" = 0 ] || options+=(quick=true)
-  run_part step 120 "$OUT/step.log" "$PYTHON" -m sparsestreet bench step "${options[@]}" "${TRAIN[@]}"
-  quote step '^(a step|on |floors:)'
+  run_part "$1" "$2" "$OUT/$1.log" "$PYTHON" -m sparsestreet bench step "${options[@]}" "${TRAIN[@]}"
+  quote "$1" '^(a step|on |floors:)'
 }
 
 run_graph() {
@@ -167,8 +167,9 @@ run_export() { # part, run
 
 call_first() {
   run_parity 120
-  run_step
+  run_step step 120
   run_graph
+  run_step replay 90 render.replay=true
   while compiling; do sleep 1; done
   finish_gsplat
   run_bench ours 120 "$PACK/plain.street" refine=3 enlarge=2 "rows=[1500000,100000]"

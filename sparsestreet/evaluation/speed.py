@@ -173,10 +173,8 @@ class _Clocks:
 
     def _raster(self, view: View) -> Callable[[], object]:
         placed = self._scene_at(view).gaussians_at(view)
-        settings, backend = self._options.settings, self._options.backend
-        return lambda: splat(
-            placed.gaussians, placed.view.camera, settings=settings, backend=backend, screen_gradients=False
-        )
+        how = {"settings": self._options.settings, "backend": self._options.backend, "replay": self._options.replay}
+        return lambda: splat(placed.gaussians, placed.view.camera, screen_gradients=False, **how)
 
     def _timed(self, work: Callable[[], object], views: Sequence[View]) -> float:
         """Milliseconds of some work on the scenes of views, which are there before the clock starts."""

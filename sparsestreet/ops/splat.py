@@ -29,6 +29,7 @@ def splat(
     screen_gradients: bool = True,
     gates: Float[Tensor, " n"] | None = None,
     changes: LeaveOneOutSums | None = None,
+    replay: bool = False,
 ) -> Rendering:
     """Render 3D Gaussians (3DGS, Kerbl et al. 2023): project, sort by depth, blend front to back.
 
@@ -56,6 +57,9 @@ def splat(
             gates are not checked, as those of a background.
         changes: is filled by the backward pass; images and gradients are the same bits without it. None: nothing is
             gathered, at no cost. Not with gates, which hide rows.
+        replay: whether "triton" renders views of a kind that it has seen as CUDA graphs: the same bits, fewer calls of
+            the host, and memory that stays. Views with gates or changes are drawn as ever; other backends launch
+            nothing.
 
     Raises:
         ValueError: wrong shapes, dtypes or devices; a camera whose pose is not a rigid motion, or whose size or lens is
@@ -82,7 +86,7 @@ def splat(
     with torch.autocast(gaussians.means.device.type, enabled=False):
         offsets = _screen_offsets(gaussians, screen_gradients, filled=chosen != "triton")
         if chosen == "triton":
-            return _module(chosen).render(gaussians, offsets, background, camera, settings, gates, changes)
+            return _module(chosen).render(gaussians, offsets, background, camera, settings, gates, changes, replay)
         raster = _module(chosen).rasterize(gaussians, offsets, camera, settings, gates=gates, changes=changes)
         return _compose(raster, offsets, background)
 

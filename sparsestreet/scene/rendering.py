@@ -222,6 +222,7 @@ def _drawn(
             screen_gradients=state.screen_gradients,
             gates=placed.gates,
             changes=None if changes is None else changes[0],
+            replay=options.replay,
         )
     rgb = splats.rgb
     for name, effect in scene.effects.items():

@@ -37,6 +37,8 @@ class RenderOptions:
 
     settings: SplatSettings = field(default_factory=SplatSettings)
     backend: str = "auto"
+    replay: bool = False
+    """Whether a GPU renders views as CUDA graphs (``sparsestreet.ops.splat``)."""
 
 
 DEFAULT_OPTIONS = RenderOptions(SplatSettings(antialias=True))

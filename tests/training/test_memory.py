@@ -79,9 +79,9 @@ class Counts(Callback):
 def device_path(monkeypatch) -> Callable[[float], None]:
     """What a step on a device allocates, on the CPU: Triton's path, whose kernels do not run. All rows are visible,
     with as many pairs as are said; parts of long tiles, at most 40 MB, are left out."""
-    from sparsestreet.ops.triton import activate, adam, lists, parts, pixels, rasterizer, screen, ssim
+    from sparsestreet.ops.triton import activate, adam, lists, parts, passes, pixels, screen, ssim
 
-    for module in (activate, adam, lists, parts, pixels, rasterizer, screen, ssim):
+    for module in (activate, adam, lists, parts, passes, pixels, screen, ssim):
         monkeypatch.setattr(module, "launch", lambda *arguments, **constants: None)
     for name in ("activate", "ssim", "adam"):
         module = importlib.import_module(f"sparsestreet.ops.{name}")

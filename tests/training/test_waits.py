@@ -4,6 +4,7 @@ The steps are whole: the scene, the op's host side, losses, regularizers, loggin
 """
 
 import csv
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,8 +17,11 @@ from lightning.pytorch.accelerators.cpu import CPUAccelerator
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from sparsestreet.data.frame_cache import to_device
+from sparsestreet.ops.triton import graphs
 from sparsestreet.scene.density import GradientDensity
 from sparsestreet.scene.density.vibrating import VibratingDensity
 from sparsestreet.scene.effects import (
@@ -41,6 +45,7 @@ from sparsestreet.scene.masks import (
     TemporalMaskSettings,
 )
 from sparsestreet.scene.nodes import Node
+from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training import losses
 from sparsestreet.training.callbacks import DensityControl
 from sparsestreet.training.losses import MaskSparsity, Photometric
@@ -161,6 +166,58 @@ def test_cameras_and_masks_of_the_car_wait_for_nothing(case: str, pretended: Non
         frame = replace(frame, camera=replace(frame.camera, shutter=shutter))
     system = make_system(nodes(), effects={"sky": Sky(SkySettings(resolution=4))})
     assert places_of_a_step(system, frame, monkeypatch) == [SPLAT]
+
+
+class HostCopies(TorchDispatchMode):
+    """Operations that write the device's memory from the host's, or the reverse."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        answer = func(*args, **(kwargs or {}))
+        name, given = func.overloadpacket.__name__, [one for one in tree_leaves(args) if isinstance(one, Tensor)]
+        crosses = {one.device for one in [*given, answer] if isinstance(one, Tensor)} == {META, torch.device("cpu")}
+        self.found += [name] * (crosses and name in ("_to_copy", "copy_"))
+        return answer
+
+
+def test_what_graphs_capture_waits_for_nothing(pretended: None, monkeypatch: pytest.MonkeyPatch):
+    """A shutter and a moved view: two kinds of views, of two graphs forward and one backward. Nor does the host copy
+    anything, which a capture refuses even where nobody waits."""
+    captures: list[list[str]] = []
+
+    class Captures:
+        def captured(self, run: Callable[[], Any]) -> tuple[Callable[[], None], Any]:
+            run()
+            before = len(found.places)
+            with HostCopies() as copies:
+                answer = run()
+            captures.append(found.places[before:] + copies.found)
+            return lambda: None, answer
+
+    monkeypatch.setattr(graphs, "Memory", Captures)
+    monkeypatch.setattr(graphs, "_kept", type(graphs._kept)())
+    monkeypatch.setattr(graphs, "COUNTS", Counter())
+    shutter = Shutter(torch.ones(3), torch.zeros(3), seconds=0.1, span=0.1)
+    frame = frame_with()
+    frame = replace(frame, camera=replace(frame.camera, shutter=shutter))
+    moved = MovedViewTerm(MovedViews(every=1), street(wall(4.0)), seed=7)
+    effects = {"sky": Sky(SkySettings(resolution=4))}
+    system = make_system(nodes(), effects=effects, options=RenderOptions(replay=True), moved_views=moved)
+    trainer = StubTrainer(system.to(META), [], max_steps=90)
+    trainer.global_step = 50
+    with waits(monkeypatch) as found:
+        frame = to_device(frame, META)
+        trainer.start()
+        for _ in range(3):
+            trainer.train(1, frame)
+        found.places.clear()
+        trainer.train(1, frame)
+    assert captures == [[]] * 6
+    assert (graphs.COUNTS["captured"], graphs.COUNTS["replayed"], graphs.COUNTS["again"]) == (6, 6, 0)
+    assert found.places == [SPLAT] * 2
 
 
 def test_a_sampled_mask_does_not_wait(pretended: None, monkeypatch: pytest.MonkeyPatch):

@@ -23,7 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import sparsestreet
 from sparsestreet.host_copy import HostCopy
 from sparsestreet.ops import backend, triton
-from sparsestreet.ops.triton import launch, rasterizer, screen
+from sparsestreet.ops.triton import graphs, launch, rasterizer, screen
 from sparsestreet.training import nonfinite
 
 META = torch.device("meta")
@@ -200,6 +200,6 @@ def waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[Waits]:
 
     with monkeypatch.context() as patch, _Numbers(found), _Operations(found):
         patch.setattr(screen, "wait_for", counted)
-        for module in (nonfinite, screen):
+        for module in (nonfinite, screen, graphs):
             patch.setattr(module, "copy_to_host", queued)
         yield found

@@ -278,7 +278,9 @@ def sum_slots(
     slots, rows, row_ends, tile_counts, sums, visible,
     COUNT: tl.constexpr, PADDED: tl.constexpr, SUM: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """``sums[row, :COUNT]`` of each visible row, in the type SUM; PADDED: COUNT rounded up to a power of two."""
+    """``sums[row, :COUNT]`` of each visible row, in the type SUM; PADDED: COUNT rounded up to a power of two.
+
+    ``visible`` may be room for more: behind the last visible row counts are 0."""
     rank = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     given = rank < visible
     count = tl.load(tile_counts + rank, given, 0)
@@ -296,7 +298,7 @@ def sum_slots(
         for i in tl.static_range(STEP):
             total += values[i].to(SUM)
     row = tl.load(rows + rank, given, 0).to(tl.int64)
-    tl.store(sums + row[:, None] * COUNT + field[None, :], total, given[:, None] & (field < COUNT)[None, :])
+    tl.store(sums + row[:, None] * COUNT + field[None, :], total, (count > 0)[:, None] & (field < COUNT)[None, :])
 
 
 def block_of(view: KernelView) -> int:

@@ -15,7 +15,7 @@ import torch
 import triton.language as tl
 
 from sparsestreet.ops.triton import launch as package
-from sparsestreet.ops.triton import lists, parts, pixels, rasterizer, screen
+from sparsestreet.ops.triton import lists, parts, passes, pixels, screen
 
 _POINTERS = {
     torch.float32: "*fp32",
@@ -41,7 +41,7 @@ class Launch:
 
 
 def record_launches(
-    monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType] = (rasterizer, screen, lists, parts, pixels, pixels)
+    monkeypatch: pytest.MonkeyPatch, modules: Sequence[ModuleType] = (passes, screen, lists, parts, pixels)
 ) -> list[Launch]:
     """A list that every launch of the modules is appended to from now on."""
     launches: list[Launch] = []
