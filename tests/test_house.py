@@ -4,6 +4,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sparsestreet"
 MIN_LINES = 60
@@ -63,6 +65,7 @@ def counted() -> dict[str, int]:
     }
 
 
+@pytest.mark.lengthy
 def test_what_breaks_a_rule_of_the_house_only_becomes_less():
     found = counted()
     assert found.keys() == ALLOWED.keys()
