@@ -1,5 +1,8 @@
 """What is read of a drive in either version equals the plan that it was written from."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -115,6 +118,33 @@ def test_points_lie_where_images_of_a_rolling_shutter_show_them(tmp_path):
     assert seen > 15
     assert max(errors) < 0.5
     assert max(still) > 5
+
+
+def test_the_options_that_a_preset_of_drivestudio_has(root, drive, tmp_path):
+    """Lenses leave images and masks, as they leave those of a folder in its layout; far returns are cut; the box of the
+    scene lies along the first pose of the vehicle."""
+    mask = tmp_path / "human/FRONT"
+    mask.mkdir(parents=True)
+    half = np.zeros((24, 32), np.uint8)
+    half[:, 20:] = 255
+    for frame in range(4):
+        cv2.imwrite(str(mask / f"{frame:03d}.png"), half)
+    reader = WaymoReader(root=root, masks=tmp_path, cameras=["FRONT"])
+    plain, options = reader.read(), replace(reader, undistort=True, lidar_ahead=(-2, 20), extent="first_pose").read()
+    assert plain.views[0].camera.distortion is not None
+    assert options.views[0].camera.distortion is plain.first_axes is None
+    camera = drive.cameras[0]
+    k = camera.intrinsics
+    shifted = k - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from the first pixel's center
+    for one, other in zip(plain.frames, options.frames, strict=True):
+        expected = cv2.undistort(one.image.numpy(), shifted, np.array(LENS))
+        # Both interpolate with weights of 1/32 of a pixel.
+        assert np.abs(other.image.numpy().astype(int) - expected.astype(int)).max() <= 2
+        seen = cv2.undistort(255 * there(one.human).numpy().astype(np.uint8), shifted, np.array(LENS)) > 0
+        assert (there(other.human).numpy() != seen).mean() < 0.01
+    assert 0 < len(options.sweeps[1].points) < len(plain.sweeps[1].points)
+    pose = drive.frame_pose(0)
+    np.testing.assert_allclose(there(options.first_axes).numpy(), pose[:3, :3], atol=1e-6)
 
 
 @pytest.mark.parametrize("direction", [1, 2, 3, 4])
