@@ -257,8 +257,8 @@ class RecordedReader(LogReader):
     undistort: bool = False
     """Whether every lens is taken out of images and masks as they are read (``DriveStudioReader``)."""
     lidar_ahead: Sequence[float | int] | None = None
-    """Meters ahead of the vehicle, least and most, of the returns that are read; None: all. A note says where the log does
-    not know its vehicle."""
+    """Meters ahead of the vehicle, least and most, of the returns that are read; None: all. A note says where the log
+    does not know its vehicle."""
     extent: SceneExtent = "world"
     """Where the scene's box lies (``DrivingLog.first_axes``): "world" or "first_pose"."""
     cache_mb: CacheSize = "auto"
