@@ -339,8 +339,8 @@ class RecordedReader(LogReader):
 
 
 def ahead_only(recording: Recording, ahead: Sequence[float | int]) -> Recording:
-    """The recording with the returns whose x in the vehicle's frame, meters, lies between the two numbers; with a note
-    where there are none, or the vehicle is unknown, and nothing is cut.
+    """Return the recording with the returns whose x in the vehicle's frame, meters, lies between the two numbers; with
+    a note where there are none, or the vehicle is unknown, and nothing is cut.
 
     The vehicle is where it was at the stamp of the sweep, or at the nearest instant at which it is known.
     """

@@ -127,7 +127,7 @@ _SAY_FRAMES = "say data.log.first_frame=N data.log.last_frame=N (0 and -1: all f
 
 
 def by_drive(part: int, *, _root_: DictConfig) -> Any:
-    """Of conf/sweep: a part of the entry of ``data.drives`` whose drive is read: 1 its first frame, 2 its last one.
+    """Return, for conf/sweep, a part of the entry of ``data.drives`` whose drive is read: 1 first frame, 2 last one.
 
     A drive is known by what the log says it is. Raises ValueError for one without an entry: it would be read whole,
     unsaid.
@@ -180,7 +180,7 @@ def _scene(log: DictConfig) -> Any:
 
 
 def of_reader(values: Mapping[str, Any], otherwise: Any, *, _root_: DictConfig) -> Any:
-    """Of conf/sweep and conf/preset: the value of the log's reader, by the name of its class."""
+    """Return, for conf/sweep and conf/preset, the value of the log's reader, by the name of its class."""
     found = values.get(_root_.data.log._target_.rpartition(".")[2], otherwise)
     return ListConfig(found) if isinstance(found, list) else found  # ``--resolve`` takes no list of Python's
 
@@ -191,7 +191,7 @@ def dashed(values: Iterable[Any]) -> str:
 
 
 def drive(*, _root_: DictConfig) -> str:
-    """Of conf/sweep: a drive in the name of a run's folder, by the folder of its log and the scene that is named."""
+    """Return, for conf/sweep, the drive in the name of a run's folder: its log's folder, and a named scene."""
     said = _scene(_root_.data.log)
     return Path(_root_.data.root).name + ("" if said is None else f"_{said}")
 

@@ -64,7 +64,7 @@ def find_segments(root: Path) -> dict[str, Path]:
 
 
 def segment_name(root: Path, scene: str | int | None, scenes: Path | str | None) -> str:
-    """The name of the wanted segment, of which no file is opened. Arguments and errors as of ``find_segment``."""
+    """Return the name of the wanted segment; no file is opened. Arguments and errors as of ``find_segment``."""
     return _wanted(sorted(find_segments(root)), scene, None if scenes is None else Path(scenes), root)
 
 
