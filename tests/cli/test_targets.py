@@ -54,7 +54,7 @@ WRAPPED: list[Callable[[dict[str, Any]], Any]] = [
     lambda part: {"_target_": "sparsestreet.evaluation.extra.ExtraMetrics", "novel": [1, part]},
     lambda part: {**part, "_target_": "${name}"},
     lambda part: {**part, "_target_": ["os", "system"]},
-    lambda part: "${by_drive:{1: {_target_: os.mkdir, path: " + "x" + "}}}",
+    lambda part: "${of_reader:{1: {_target_: os.mkdir, path: " + "x" + "}}}",
     lambda part: "${oc.create:'{_target_: os.mkdir}'}",
     lambda part: "${oc.env:HOME}",
     lambda part: "${${name}:HOME}",

@@ -151,7 +151,7 @@ def sweep_problem(arguments: list[str]) -> str | None:
         )
     absent = [root for root in ([roots] if Path(roots).is_dir() else roots.split(",")) if not Path(root).is_dir()]
     if absent:
-        return f"data.root names {', '.join(absent)}, which is no folder here: give drives in DriveStudio's layout"
+        return f"data.root names {', '.join(absent)}, which is no folder here: give folders of drives"
     return None
 
 
