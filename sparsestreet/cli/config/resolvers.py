@@ -196,6 +196,11 @@ def drive(*, _root_: DictConfig) -> str:
     return Path(_root_.data.root).name + ("" if said is None else f"_{said}")
 
 
+def last_part(path: str) -> str:
+    """Return the name of a folder, for configurations of runs that were written before ``drive``."""
+    return Path(path).name
+
+
 _TOLD = ("seed", "method", "sparsify", "assignment", "preset", "name", "out", "folder", "data", "sweep")
 """Keys that are in a job's folder already, or tell its drive."""
 
@@ -238,6 +243,7 @@ _RESOLVERS = {
     "by_scene": by_scene,
     "dashed": dashed,
     "drive": drive,
+    "last_part": last_part,
     "of_reader": of_reader,
 }
 
