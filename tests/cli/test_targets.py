@@ -202,6 +202,7 @@ def test_words_of_a_received_run_begin_no_sweep(tmp_path, monkeypatch):
     assert len(asked) == 1
 
 
+@pytest.mark.lengthy
 def test_what_the_user_says_now_is_the_users(tmp_path, capsys):
     part = "++loss.mine={_target_:tests.cli.toy.loss.MeanColor,weight:0.1}"
     run = received(tmp_path / "run", "seed=3", part, "logger=wandb", "++trainer.accumulate_grad_batches=2")
