@@ -37,6 +37,7 @@ RUN_ELSEWHERE = (
     (r"hydra/launcher=submitit", "needs a cluster", "tests/cli/test_submitit.py"),
     (r"trainer=ddp", "starts processes", "tests/training/parallel/test_several.py"),
     (r"train \+sweep=(?!tiny|NAME)", "takes hours; every job is composed", "tests/cli/test_sweep.py"),
+    (r"data masks ", "needs a segmenter", "tests/cli/test_masks.py"),
     (r"hydra\.searchpath", "needs files of the reader's own", "tests/cli/test_extending.py"),
 )
 

@@ -37,7 +37,8 @@ def problem_of(command: str) -> str | None:
     if not words or {"--help", "resume=RUN"} & set(words) or any("searchpath" in word for word in words):
         return None
     if name in OF_HYDRA:
-        words = [word for word in words if not word.startswith(("from=", "to=", "layout", "jpeg_quality=", "flavor="))]
+        own = ("from=", "to=", "layout", "jpeg_quality=", "flavor=", "model=", "classes=")
+        words = [word for word in words if not word.startswith(own)]
         words = [word for word in words if "=" in word or word.startswith("-")] if name == "data" else words
         several = ["-m"] if any(word.startswith("+sweep=") for word in words) else []
         return override_problem(with_effect_keys([*several, *words]))

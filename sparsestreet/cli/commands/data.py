@@ -1,4 +1,4 @@
-"""``sparsestreet data``: logs are checked, converted and made, and their objects found."""
+"""``sparsestreet data``: logs are checked, converted and made, their objects found, and masks of their images made."""
 
 import sys
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from sparsestreet.cli.commands.masks import masks
 from sparsestreet.cli.commands.options import shown
 from sparsestreet.cli.commands.tracks import tracks
 from sparsestreet.cli.config.log_from_options import UsageError, compose_data, configured_log, reader_of
@@ -135,6 +136,11 @@ sparsestreet data make [seed=N] [data.log.settings.width=W ...]
 sparsestreet data tracks DIR [data=... tracks.settings.min_moved=2.0 tracks.join=true to=DIR ...]
     find what moves in the lidar of a log, annotated or not: a table, boxes in DriveStudio's layout, a map from above
     and a sheet of images, in DIR (outputs/tracks/LOG); the same command again takes the answer that is kept
+sparsestreet data masks DIR model=FILE classes=cityscapes|ade20k|coco|coco80|NAMES [to=DIR size=1024 threads=4 ...]
+    write masks of sky, people and vehicles by a semantic segmenter in ONNX's format, for data.log.masks=DIR, and a
+    sheet of images that shows them, in DIR (outputs/masks/LOG); the same command goes on where it was interrupted
+    classes: what the segmenter tells apart; NAMES is a file with the name of a class a line
+    size: pixels of the longer side that it sees; mean, std: its scaling of colors, else ImageNet's
 """
 
 
@@ -144,16 +150,16 @@ _NO_CHECKED = "no log is named: say sparsestreet data check DIR, DIR being the f
 def data(arguments: list[str]) -> int:
     """Run the sub-command; 2 on wrong usage."""
     verb, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
-    if verb not in ("check", "convert", "make", "tracks") or "--help" in rest:
+    if verb not in ("check", "convert", "make", "masks", "tracks") or "--help" in rest:
         print(USAGE)
         return 0 if verb in ("-h", "--help") or "--help" in rest else 2
     if verb == "convert":
         return convert(rest)
     try:
-        return {"check": _check, "make": _make, "tracks": tracks}[verb](rest)
+        return {"check": _check, "make": _make, "masks": masks, "tracks": tracks}[verb](rest)
     except BrokenPipeError:
         raise  # somebody reads no more of our output
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         print(f"sparsestreet data {verb}: {error}", file=sys.stderr)
         return 2
 

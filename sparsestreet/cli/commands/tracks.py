@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.config.log_from_options import UsageError, configured_log, reader_of
+from sparsestreet.cli.config.log_from_options import UsageError, configured_log, reader_of, without_folder
 from sparsestreet.cli.config.validate import type_problem
 
 if TYPE_CHECKING:
@@ -33,16 +33,11 @@ _NEAR = 0.5
 def tracks(arguments: Sequence[str]) -> int:
     """Find, print and write. Raises UsageError for words that cannot be followed, ValueError without lidar."""
     given = [text.partition("=")[2] for text in arguments if text.startswith("to=")]
-    folders = [text for text in arguments if "=" not in text and not text.startswith("-")]
     if len(given) > 1 or "" in given:
         raise UsageError(f"to=DIR names one folder, got {' '.join(arguments)}")
-    if written := [text for text in arguments if text.startswith("out=")]:
-        raise UsageError(f"out= is of trainings: say to={written[0].partition('=')[2]} for the folder of the boxes")
-    if len(folders) > 1:
-        raise UsageError(f"{ONE_LOG}, got {' '.join(folders)}")
-    words = [text for text in arguments if text not in folders and not text.startswith("to=")]
+    words, folder = without_folder([text for text in arguments if not text.startswith("to=")], ONE_LOG)
     words = words if any(text.startswith("tracks=") for text in words) else ["tracks=found", *words]
-    cfg, told = configured_log(words, Path(folders[0]) if folders else None, no_log=NO_LOG, one_log=ONE_LOG)
+    cfg, told = configured_log(words, folder, no_log=NO_LOG, one_log=ONE_LOG)
     if cfg.tracks.name != "found":
         raise UsageError(f"this command finds tracks, and tracks={cfg.tracks.name} does not: leave it out")
     if problem := type_problem({"tracks": OmegaConf.to_container(cfg.tracks, resolve=True)}):

@@ -123,6 +123,20 @@ class UsageError(ValueError):
     """The command is not one that can be followed."""
 
 
+def without_folder(words: Sequence[str], one_log: str) -> tuple[list[str], Path | None]:
+    """Return the words without the folder of a log, and the folder; None where it is not among them.
+
+    Raises UsageError, which begins with ``one_log``, for several folders, and for ``out=...``, which such commands do
+    not have.
+    """
+    folders = [text for text in words if "=" not in text and not text.startswith("-")]
+    if written := [text for text in words if text.startswith("out=")]:
+        raise UsageError(f"out= is of trainings: say to={written[0].partition('=')[2]} for the folder that is written")
+    if len(folders) > 1:
+        raise UsageError(f"{one_log}, got {' '.join(folders)}")
+    return [text for text in words if text not in folders], Path(folders[0]) if folders else None
+
+
 def configured_log(
     overrides: Sequence[str], folder: Path | None, *, no_log: str, one_log: str
 ) -> tuple[DictConfig, str | None]:
