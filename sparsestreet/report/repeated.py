@@ -109,12 +109,14 @@ def _numbers(run: RunSummary, protocol: Protocol) -> Iterator[tuple[_Quantity, f
     yield _MB, run.bytes_total / 1e6
 
 
-def verdict(recorded: RunSummary, found: RunSummary, compared: Sequence[Comparison]) -> str:
-    """Say in one line what each number is, and whether the row holds."""
+def verdict(recorded: RunSummary, found: RunSummary, compared: Sequence[Comparison], *, trained: bool) -> str:
+    """Say in one line what each number is, and whether the row holds; ``trained``: or measured, in a rounded scene."""
     run = recorded.run
     held = "holds" if all(one.holds for one in compared) else "does not hold"
     same = all(one.found == one.recorded for one in compared)
-    unlike = "" if same or not _alike(recorded, found) else ", not to the bit, on the same machine and commit"
+    unlike = (
+        "" if same or not (trained and _alike(recorded, found)) else ", not to the bit, on the same machine and commit"
+    )
     title = one_line(f"{run.label}, {run.scene}, seed {run.seed}")
     return f"{title}: {'; '.join(map(str, compared))}: {held}{unlike}"
 

@@ -169,6 +169,7 @@ def test_other_data_another_configuration_and_seed_are_refused(copied, typed, tm
         path = row_of(tmp_path, replace(summary, run=replace(summary.run, **change)))
         assert report(["verify", str(path), "row=1", f"out={tmp_path / 'again'}", *typed]) == 1
         assert said in capsys.readouterr().err
+    path = row_of(tmp_path, summary)
     assert report(["verify", str(path), "row=1", "shedule.x=1"]) == 1
     assert "did you mean 'schedule" in capsys.readouterr().err
     assert not (tmp_path / "again").exists()

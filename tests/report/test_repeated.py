@@ -71,7 +71,7 @@ def test_counts_and_bytes_count_by_their_part_and_a_lost_number_does_not_hold():
 
 def test_the_verdict_is_one_line():
     recorded, again = seeds(25.5, 25.0)
-    line = verdict(recorded, again, comparisons(recorded, again, (), DRIVESTUDIO))
+    line = verdict(recorded, again, comparisons(recorded, again, (), DRIVESTUDIO), trained=True)
     assert "PSNR 25.000 dB, recorded 25.500 dB (± 0.050 dB): DOES NOT HOLD; vehicles 22.000 dB, as recorded" in line
     assert line.endswith("does not hold, not to the bit, on the same machine and commit")
-    assert "\n" not in verdict(make_summary("a\n"), again, ())
+    assert "\n" not in verdict(make_summary("a\n"), again, (), trained=True)

@@ -87,7 +87,7 @@ def _verify(request: VerifyRequest, typed: list[str]) -> None:
         recorded = summaries.pop(number - 1)
         found = _again(request, typed, bundle, number, recorded)
     compared = comparisons(recorded, found, summaries, PROTOCOLS[bundle.bundle.protocol])
-    said = printable(f"row {number}, {verdict(recorded, found, compared)}")
+    said = printable(f"row {number}, {verdict(recorded, found, compared, trained=not request.evaluate)}")
     if not all(one.holds for one in compared):
         raise ValueError(said)
     print(said)
