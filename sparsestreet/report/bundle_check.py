@@ -1,4 +1,4 @@
-"""Reads and checks a bundle, which comes from anybody.
+"""Read and check a bundle, which comes from anybody.
 
 Its members have fixed names and limited sizes, records are read as strictly as those of a run, and nothing of it is
 made, imported or written elsewhere than into a temporary folder.

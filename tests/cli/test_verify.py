@@ -103,6 +103,7 @@ def copied(finished, tmp_path) -> Path:
     return shutil.copytree(finished, tmp_path / "runs/finished", ignore=shutil.ignore_patterns("checkpoints"))
 
 
+@pytest.mark.lengthy
 def test_a_row_trained_again_holds_to_the_bit(copied, typed, tmp_path, capsys):
     path, out = tmp_path / "table.zip", tmp_path / "again"
     assert report([str(copied.parent), f"bundle={path}"]) == 0
@@ -110,7 +111,7 @@ def test_a_row_trained_again_holds_to_the_bit(copied, typed, tmp_path, capsys):
     assert report(["verify", str(path), "row=1", f"out={out}", *typed]) == 0
     line = capsys.readouterr().out.splitlines()[-1]
     assert line.startswith("row 1, streetgs+removal, ")
-    assert line.endswith("MB 0.063, as recorded: holds") or line.endswith("as recorded: holds")
+    assert line.endswith(", as recorded: holds")
     assert "recorded " not in line.replace("as recorded", "")
 
 
@@ -141,6 +142,7 @@ def test_a_record_that_was_changed_and_hashed_again_does_not_hold(copied, typed,
     assert error.count("DOES NOT HOLD") == 1
 
 
+@pytest.mark.slow
 def test_a_scene_that_goes_along_is_measured_instead(copied, typed, tmp_path, capsys):
     path, out = tmp_path / "table.zip", tmp_path / "measured"
     assert report([str(copied.parent), f"bundle={path}", "scenes=true"]) == 0
@@ -154,6 +156,7 @@ def test_a_scene_that_goes_along_is_measured_instead(copied, typed, tmp_path, ca
     assert capsys.readouterr().err.count("DOES NOT HOLD") == 1
 
 
+@pytest.mark.slow
 def test_other_data_another_configuration_and_seed_are_refused(copied, typed, tmp_path, capsys):
     summary = SUMMARY.read(copied)
     config = summary.run.config | {"schedule.lambda_m": 3.0}
