@@ -69,7 +69,7 @@ def cases(gaussians: Gaussians, cotangent: Cotangent) -> dict[str, Case]:
 def probed(run: Case, blank: Answer, cameras: list[Camera], replay: bool) -> Answer:
     """What becomes of one case; the first renderings of each kind compile, guess and capture."""
     seconds: dict[bool, list[float]] = {False: [], True: []}
-    equal, before = True, COUNTS.replayed
+    equal, before = True, COUNTS["replayed"]
     try:
         for camera in [*cameras[:4], *cameras]:
             answers = [timed(run, camera, kind and replay, seconds[kind]) for kind in (False, True)]
@@ -78,7 +78,7 @@ def probed(run: Case, blank: Answer, cameras: list[Camera], replay: bool) -> Ans
     except Exception as error:  # what a device refuses is what is asked
         lines = str(error).strip().splitlines()
         return Answer(**asdict(blank) | {"refused": f"{type(error).__name__}: {lines[0] if lines else 'no message'}"})
-    whole = {"equal": equal, "replays": COUNTS.replayed - before}
+    whole = {"equal": equal, "replays": COUNTS["replayed"] - before}
     if replay:
         ms, replayed = (round(1000 * median(seconds[kind][4:]), 3) for kind in (False, True))
         whole |= {"ms": ms, "replayed_ms": replayed, "peak_mb": round(torch.cuda.max_memory_allocated() / 1e6)}

@@ -4,6 +4,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sparsestreet"
 MIN_LINES = 60
@@ -11,7 +13,7 @@ MAX_LINES = 600
 ALLOWED = {
     "modules below 60 lines": 13,
     "modules above 600 lines": 0,
-    "docstrings that begin with a fragment": 76,
+    "docstrings that begin with a fragment": 74,
     "docstrings that begin in the third person": 30,
     "limits that are no MIN or MAX": 17,
     "words of README": 900,
@@ -63,6 +65,7 @@ def counted() -> dict[str, int]:
     }
 
 
+@pytest.mark.lengthy
 def test_what_breaks_a_rule_of_the_house_only_becomes_less():
     found = counted()
     assert found.keys() == ALLOWED.keys()

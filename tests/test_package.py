@@ -47,3 +47,8 @@ def test_values_are_frozen_and_options_are_named():
     families = [(name, base) for name, (_, bases) in classes.items() for base in bases if base.endswith(settings)]
     assert len(families) > 10
     assert [pair for pair in families if len(named.intersection(pair)) == 1] == []
+
+
+def test_modules_are_not_imported_from_the_folder_above_a_checkout():
+    """Where another project's folder may be called as a package that is looked for, such as triton."""
+    assert str(Path(__file__).parents[2]) not in sys.path

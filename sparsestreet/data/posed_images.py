@@ -135,6 +135,7 @@ class PosedReader(RecordedReader):
     """skip: images that are listed and have no file are left out with a note, before frames are counted."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_missing(self.missing)
 
     @abstractmethod
@@ -154,7 +155,15 @@ class PosedReader(RecordedReader):
         if problems := _missing_points(table) + self._problems(images, table.path):
             raise LogError(problems)
         rig = [
-            lens_camera(name, index, lens=lens, recorded_size=size, width=self.width, pinhole_fov=self.pinhole_fov)
+            lens_camera(
+                name,
+                index,
+                lens=lens,
+                recorded_size=size,
+                width=self.width,
+                pinhole_fov=self.pinhole_fov,
+                undistort=self.undistort,
+            )
             for index, (name, (lens, size)) in enumerate(images.cameras.items())
         ]
         shots = [

@@ -6,9 +6,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, cast
+from typing import Any, ClassVar, TypeVar, cast, get_args
 
-from sparsestreet.data.log import DrivingLog
+from sparsestreet.data.log import DrivingLog, SceneExtent
 from sparsestreet.data.problems import Problem
 
 
@@ -182,6 +182,14 @@ def listed(names: Sequence[str]) -> str:
     """
     more = f", ... ({len(names)} in all)" if len(names) > _SHOWN else ""
     return ", ".join(names[:_SHOWN]) + more or "none"
+
+
+def check_region(extent: str, lidar_ahead: Sequence[float | int] | None) -> None:
+    """Raise ValueError for a scene's box that is none of ``SceneExtent``, and for distances that are no interval."""
+    if extent not in get_args(SceneExtent):
+        raise ValueError(f"extent must be one of {', '.join(get_args(SceneExtent))}, got {extent!r}")
+    if lidar_ahead is not None and not (len(lidar_ahead) == 2 and lidar_ahead[0] < lidar_ahead[1]):
+        raise ValueError(f"lidar_ahead needs a least and a larger distance, got {lidar_ahead}: say [-2, 80]")
 
 
 def frame_window(num_frames: int, first_frame: int, last_frame: int, root: Path) -> range:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -27,15 +27,16 @@ from sparsestreet.data.images import (
 )
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.lidar import color_points, depth_image, seen_points
-from sparsestreet.data.log import DrivingLog, VehiclePath, absence_notes
+from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath, absence_notes
 from sparsestreet.data.poses import PosePath, dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
-from sparsestreet.data.reader import LogReader
+from sparsestreet.data.reader import LogReader, check_region
 from sparsestreet.data.recorded_images import RecordedImage
 from sparsestreet.data.rig import RigCamera, rig_camera
 from sparsestreet.data.timestamps import LogClock
 from sparsestreet.data.tracks import checked_track, repeated, timed_tracks, track_in_window
 from sparsestreet.geometry.boxes import CarriedPoints, without_frames
+from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.types import MASK_KINDS, Frame, SparsePoints, Sweep, Track, View
 
 T = TypeVar("T")
@@ -253,8 +254,21 @@ class RecordedReader(LogReader):
     masks: Path | str | None = None
     """Folder of masks that somebody made: ``sky``, ``human``, ``vehicle``, ``ego``, in each a folder a camera, in it
     PNGs with the stems of the images, white where the kind is. None: those of the data set, if it has any."""
+    undistort: bool = False
+    """Whether every lens is taken out of images and masks as they are read (``DriveStudioReader``)."""
+    lidar_ahead: Sequence[float | int] | None = None
+    """Meters ahead of the vehicle, least and most, of the returns that are read; None: all. A note says where the log
+    does not know its vehicle."""
+    extent: SceneExtent = "world"
+    """Where the scene's box lies (``DrivingLog.first_axes``): "world" or "first_pose"."""
     cache_mb: CacheSize = "auto"
     """Decoded frames kept in memory, MB (1e6 bytes)."""
+
+    first_pose_of: ClassVar[str] = "vehicle"
+    """Whose pose the first one is, where the log knows its vehicle; "camera": as DriveStudio's layout has it."""
+
+    def __post_init__(self) -> None:
+        check_region(self.extent, self.lidar_ahead)
 
     @property
     def folder(self) -> Path:
@@ -307,13 +321,47 @@ class RecordedReader(LogReader):
     def read(self) -> DrivingLog:
         recording = self.recording()
         recording = replace(recording, notes=(*recording.notes, *self._pixel_notes(recording)))
-        return log_of(recording, cache_bytes=cache_bytes(self.cache_mb), check=self.check_contents)
+        if self.lidar_ahead is not None:
+            recording = ahead_only(recording, self.lidar_ahead)
+        log = log_of(recording, cache_bytes=cache_bytes(self.cache_mb), check=self.check_contents)
+        return replace(log, first_axes=self._first_axes(recording)) if self.extent == "first_pose" else log
+
+    def _first_axes(self, recording: Recording) -> Float64[Tensor, "3 3"]:
+        path = recording.vehicle if self.first_pose_of == "vehicle" else None
+        first = recording.shots[0].world_from_camera if path is None else path.poses[0]
+        return first[:3, :3]
 
     def _pixel_notes(self, recording: Recording) -> Iterator[str]:
         """Of images, by their headers."""
         for camera in recording.rig:
             own = [shot for shot in recording.shots if shot.camera == camera.index]
             yield from image_notes(camera.name, [path for shot in own if (path := shot.path) is not None])
+
+
+def ahead_only(recording: Recording, ahead: Sequence[float | int]) -> Recording:
+    """Return the recording with the returns whose x in the vehicle's frame, meters, lies between the two numbers; with
+    a note where there are none, or the vehicle is unknown, and nothing is cut.
+
+    The vehicle is where it was at the stamp of the sweep, or at the nearest instant at which it is known.
+    """
+    path, sweeps, stamps = recording.vehicle, recording.sweeps, recording.frame_stamps
+    if sweeps is None or path is None or stamps is None:
+        why = "no lidar is read" if sweeps is None else "the log does not tell where its vehicle was"
+        note = f"lidar_ahead={list(ahead)} has no effect: {why}"
+        return replace(recording, notes=(*recording.notes, note))
+
+    def read(sweep: LidarSweep, stamp: int) -> Float64[Tensor, "n 3"]:
+        points, when = sweep.read(), torch.tensor([stamp]).clamp(path.stamps[0], path.stamps[-1])
+        x = transform_points(inverse(path.at(when)[0]), points)[:, 0]
+        return points[(x > ahead[0]) & (x < ahead[1])]
+
+    cut = {
+        # Behind the last image there are no frames, and no sweep is read.
+        index: replace(sweep, read=partial(read, sweep, stamps[index] if sweep.stamp is None else sweep.stamp))
+        for index, sweep in sweeps.items()
+        if index < len(stamps)
+    }
+    return replace(recording, sweeps=cut)
 
 
 def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[], list[Problem]]) -> DrivingLog:

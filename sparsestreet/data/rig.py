@@ -179,6 +179,7 @@ def lens_camera(
     recorded_size: tuple[int, int],
     width: int | None = None,
     pinhole_fov: float | None = None,
+    undistort: bool = False,
 ) -> RigCamera[Name]:
     """As ``rig_camera``, of a camera with a lens of any model. What the splat op cannot simulate is taken out.
 
@@ -192,6 +193,7 @@ def lens_camera(
         recorded_size: (width, height) of the recorded images.
         width: as in ``rig_camera``.
         pinhole_fov: degrees that the pinhole sees from its left to its right edge; None: by the resolution.
+        undistort: as in ``rig_camera``, of a lens that could be simulated.
 
     Raises ValueError for a width or an angle that cannot be.
     """
@@ -204,6 +206,7 @@ def lens_camera(
             distortion=brown_conrady,
             recorded_size=recorded_size,
             width=width,
+            undistort=undistort,
         )
     size = _scaled_size(name, recorded_size, width)
     intrinsics = _scaled(lens.pinhole, recorded_size, size)

@@ -6,8 +6,9 @@
    C++, ``triton`` for GPUs. All follow the formula in ``spherical_harmonics``.
 3. Steps around the op, in torch and as fused kernels (``backend`` chooses). ``activate`` turns the rows of all nodes
    into Gaussians, and ``poses`` places boxes. ``sky`` adds the sky behind the splats; its geometry is in ``cube_map``.
-   ``ssim`` is D-SSIM (``ssim_window`` its window). ``adam`` steps the rows that were seen, or those whose gradient is
-   finite.
+   ``ssim`` is D-SSIM (``ssim_window`` its window), ``photometric`` the loss around it, ``pixel_losses`` are those of
+   depth and sky. ``statistics`` is what density control sums. ``adam`` steps the rows that were seen, or of all
+   parameters those whose gradient is finite.
 """
 
 from sparsestreet.ops.backend import resolve_backend

@@ -6,8 +6,9 @@ and write the moments of all: Taming 3DGS (Mallick et al. 2024) and gsplat's Sel
 from Adam's formula (Kingma & Ba 2015, algorithm 1).
 """
 
+import itertools
 import math
-from ctypes import byref
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -83,74 +84,91 @@ def check_shapes(*tensors: Tensor) -> None:
 
 NONE = torch.iinfo(torch.int64).max
 """In place of the first refused row where there is none."""
+WIDEST_ROW = 256
+"""Numbers of the widest row that steps or rests as one."""
 
 
 @torch.no_grad()
-def adam_rows_(
-    parameter: Float[Tensor, "..."],
-    gradient: Float[Tensor, "..."],
-    exp_avg: Float[Tensor, "..."],
-    exp_avg_sq: Float[Tensor, "..."],
-    refused: Int64[Tensor, "2"],
-    step: AdamStep,
+def adam_all_(
+    parameters: Sequence[Tensor],
+    gradients: Sequence[Tensor],
+    first: Sequence[Tensor],
+    second: Sequence[Tensor],
+    refused: Int64[Tensor, "parameters 2"],
+    steps: Sequence[AdamStep],
+    widths: Sequence[int],
     *,
-    width: int,
     backend: str = "auto",
 ) -> None:
-    """Update ``parameter`` and both moments by Adam; rows whose gradient is not finite keep every bit.
+    """Update parameters and their moments by Adam; rows whose gradient is not finite keep every bit.
 
     Where all are finite it is torch.optim.Adam without weight decay. On processors with fused multiplication "cpu" has
-    the bits of its ``fused`` form. Nothing waits for a device, but for "torch" on a GPU.
+    the bits of its ``fused`` form. The library is called once, and a GPU launches one kernel. Nothing waits for a
+    device, but for "torch" on a GPU.
 
     Args:
-        parameter: of one shape with its gradient and moments.
-        refused: on the same device: the number of such rows is added to the first, and the second becomes the number of
-            the first of them, if it is less (``NONE`` stands for none).
-        step: the numbers of the step.
-        width: numbers of a row, which lie side by side.
-        backend: "torch", "cpu", "triton", or "auto" for the one that suits the tensors.
+        parameters: of any shapes, on one device.
+        gradients: one a parameter, of its shape.
+        first: first moments, of the same shapes.
+        second: second moments.
+        refused: contiguous, on the same device: of each parameter, the number of such rows is added to the first, and
+            the second becomes the number of the first of them, if it is less (``NONE`` stands for none).
+        steps: the numbers of the step of each parameter.
+        widths: numbers of a row of each, which lie side by side.
+        backend: "torch", "cpu", "triton", or "auto" for the one that suits all tensors.
 
     Raises:
-        ValueError: for tensors of different shapes, a width that does not divide them, and as ``fused_backend`` does.
+        ValueError: for tensors of different shapes, a width that does not divide them or above WIDEST_ROW, and as
+            ``fused_backend`` does.
         RuntimeError: as ``fused_backend`` does.
     """
-    check_shapes(parameter, gradient, exp_avg, exp_avg_sq)
-    if not parameter.numel():
+    tables = list(zip(parameters, gradients, first, second, strict=True))
+    for (parameter, *others), width in zip(tables, widths, strict=True):
+        check_shapes(parameter, *others)
+        if not 1 <= width <= WIDEST_ROW or parameter.numel() % width:
+            raise ValueError(f"{parameter.numel()} numbers do not come in rows of {width}, of {WIDEST_ROW} at most")
+    written = (*parameters, *first, *second)
+    if not written:
         return
-    if width < 1 or parameter.numel() % width:
-        raise ValueError(f"{parameter.numel()} numbers do not come in rows of {width}")
-    chosen = fused_backend(backend, parameter, exp_avg, exp_avg_sq)
-    if chosen == "torch" or not all(one.is_contiguous() for one in (parameter, exp_avg, exp_avg_sq)):
-        _in_torch(parameter, gradient, exp_avg, exp_avg_sq, refused, step, width)
+    chosen = fused_backend(backend, *written)
+    if chosen == "torch" or not all(one.is_contiguous() for one in written):
+        for table, counts, step, width in zip(tables, refused, steps, widths, strict=True):
+            _in_torch(*table, counts, step, width)
         return
-    step_rows_ = _step_in_library_
+    # They live until the step is on its way.
+    gradients = [gradient.contiguous() for gradient in gradients]
     if chosen == "triton":
-        from sparsestreet.ops.triton.adam import step_finite_rows_
+        from sparsestreet.ops.triton.adam import AdamTables
 
-        step_rows_ = step_finite_rows_
-    step_rows_(parameter, gradient.contiguous(), exp_avg, exp_avg_sq, refused, width, step.numbers)
+        stepped = AdamTables(parameters, gradients, first, second, refused, widths)
+        stepped.fill([step.numbers for step in steps])
+        stepped.launch()
+    else:
+        _step_in_library_(list(zip(parameters, gradients, first, second, strict=True)), refused, steps, widths)
+    # Autograd does not see what is written, but a graph that holds old values must refuse its backward pass.
+    increment_version(written)
 
 
 def _step_in_library_(
-    parameter: Tensor,
-    gradient: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    refused: Tensor,
-    width: int,
-    numbers: tuple[float, ...],
+    tables: Sequence[tuple[Tensor, ...]], refused: Tensor, steps: Sequence[AdamStep], widths: Sequence[int]
 ) -> None:
-    tensors = native.pointers(parameter, gradient, exp_avg, exp_avg_sq)
-    threads, counted = native.thread_count(), refused.data_ptr()
-    rows = native.CAdamRows(parameter.numel() // width, width, *tensors, *numbers, threads, counted)
-    native.load_library().splat_adam(parameter.dtype == torch.float64, FASTEST_VARIANT, byref(rows))
-    # Autograd does not see what the library writes, but a graph that holds old values must refuse its backward pass.
-    increment_version((parameter, exp_avg, exp_avg_sq))
+    rows = [
+        native.CAdamRows(parameter.numel() // width, width, *native.pointers(parameter, *others), *step.numbers, counts)
+        for (parameter, *others), counts, step, width in zip(
+            tables, itertools.count(refused.data_ptr(), 2 * refused.element_size()), steps, widths, strict=False
+        )
+    ]
+    native.load_library().splat_adam(
+        tables[0][0].dtype == torch.float64, FASTEST_VARIANT, (native.CAdamRows * len(rows))(*rows), len(rows),
+        native.thread_count(),
+    )  # fmt: skip
 
 
 def _in_torch(
     parameter: Tensor, gradient: Tensor, first: Tensor, second: Tensor, refused: Tensor, step: AdamStep, width: int
 ) -> None:
+    if not parameter.numel():
+        return
     tables = [values.reshape(-1, width) for values in (parameter, gradient, first, second)]
     finite = finite_rows(tables[1], refused)
     adam_step_(tables[0], tables[1], tables[2], tables[3], finite, step, backend="torch")
@@ -160,7 +178,7 @@ def _in_torch(
 
 
 def finite_rows(gradient: Tensor, refused: Tensor) -> Tensor:
-    """Which entries of the first dimension are finite, bool [n]; the others are counted as in ``adam_rows_``."""
+    """Which entries of the first dimension are finite, bool [n]; the others are counted as in ``adam_all_``."""
     # unflatten gives parameters of one number per row a second dimension as well.
     finite = gradient.unflatten(0, (-1, 1)).flatten(1).isfinite().all(1)
     if len(finite):

@@ -21,10 +21,7 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backen
     ``backend``: "torch", "cpu" (C++), "triton", or "auto" for the one that suits the tensors. Raises as
     :func:`sparsestreet.ops.backend.fused_backend` does, and ValueError below 11x11 pixels or for different shapes.
     """
-    if image.shape != truth.shape:
-        raise ValueError(f"SSIM compares images of one shape, got {tuple(image.shape)} and {tuple(truth.shape)}")
-    if min(image.shape[:2]) < WINDOW:
-        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, got {tuple(image.shape[:2])}")
+    check_sizes(image, truth)
     image, truth = image.contiguous(), truth.detach().contiguous()
     chosen = fused_backend(backend, image, truth)
     if chosen == "cpu":
@@ -40,6 +37,14 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], *, backen
     luminance = (2 * product + C1) / (squares + C1)
     contrast_structure = (2 * (mean_xy - product) + C2) / (mean_xx + mean_yy - squares + C2)
     return (luminance * contrast_structure).mean()
+
+
+def check_sizes(image: Tensor, truth: Tensor) -> None:
+    """Raise ValueError for images of different shapes, or smaller than the window."""
+    if image.shape != truth.shape:
+        raise ValueError(f"SSIM compares images of one shape, got {tuple(image.shape)} and {tuple(truth.shape)}")
+    if min(image.shape[:2]) < WINDOW:
+        raise ValueError(f"SSIM needs at least {WINDOW}x{WINDOW} pixels, got {tuple(image.shape[:2])}")
 
 
 def _blur(planes: Float[Tensor, "1 c h w"]) -> Float[Tensor, "1 c i j"]:

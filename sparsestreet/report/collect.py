@@ -63,8 +63,7 @@ def _kept(summary: RunSummary) -> dict[str, object]:
         **{name: getattr(run, name) for name in ("label", "method", "sparsify", "scene", "seed", "split", "steps")},
         "config_hash": run.config_hash,
         "data_hash": run.data_hash,
-        # A repository is no place for the folders of a machine.
-        "command": re.sub(r"(?<![^=\s,\[])(?:~|\.{0,2})/[^\s,\]]*/", "", run.command),
+        "command": without_folders(run.command),
         "source": run.source,
         "machine": {**vars(run.machine), "device": run.device, "threads": run.threads},
         "sizes": summary.resolutions,
@@ -79,6 +78,15 @@ def _kept(summary: RunSummary) -> dict[str, object]:
         "quiet": summary.latency.noise.quiet and (run.noise is None or run.noise.quiet),
         "training_seconds": run.training_seconds,
     }
+
+
+def without_folders(command: str) -> str:
+    """Return a command with the last words of its paths: a record that leaves a machine names no folder of it.
+
+    >>> without_folders("sparsestreet train data.root=/home/me/drive out=../runs/a b=1/2")
+    'sparsestreet train data.root=drive out=a b=1/2'
+    """
+    return re.sub(r"(?<![^=\s,\[])(?:~|\.{0,2})/[^\s,\]]*/", "", command)
 
 
 def check_definitions(records: Sequence[RunRecord]) -> None:

@@ -48,22 +48,12 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     failures = read_failures(sweep)
     records = sweep_records(sweep)
     found = variants(records)
-    alike = effects_alike(found)
     grids = _grids(found, failures, protocol, name)
     said = summary_line(found, protocol)
     folder = sweep / "report"
     figures, absent = _figures(found, protocol, folder / "figures")
-    notes = [
-        *incomplete(found),
-        *why_apart(found),
-        *_caps(found),
-        *busy_variants(found),
-        *([f"{alike}: records/cost.json of a run has what each costs and brings"] if alike else []),
-        *_baseline(found),
-        *_unfinished(records),
-        *absent,
-    ]
-    write_atomically(folder / "tables.md", markdown(grids) + "\n" + "".join(f"- {note}\n" for note in notes))
+    notes = [*_notes(found, records), *absent]
+    write_atomically(folder / "tables.md", _with_notes(grids, notes))
     write_atomically(folder / "tables.tex", latex(grids))
     write_atomically(folder / "tables.csv", comma_separated(grids))
     page = Page(
@@ -78,6 +68,30 @@ def write_report(sweep: Path, name: str | None = None, protocol: Protocol = DRIV
     )
     write_atomically(folder / "index.html", html(page))
     return SweepReport(folder, tuple(grids), tuple(notes), said)
+
+
+def sweep_markdown(records: Sequence[RunRecord], name: str | None = None, protocol: Protocol = DRIVESTUDIO) -> str:
+    """Return the tables of a sweep's runs with their notes; the rest as in ``write_report``, without failed runs."""
+    check_definitions(records)
+    found = variants(records)
+    return _with_notes(_grids(found, (), protocol, name), _notes(found, records))
+
+
+def _with_notes(grids: Sequence[Grid], notes: Sequence[str]) -> str:
+    return markdown(grids) + "\n" + "".join(f"- {note}\n" for note in notes)
+
+
+def _notes(found: Sequence[Variant], records: Sequence[RunRecord]) -> list[str]:
+    alike = effects_alike(found)
+    return [
+        *incomplete(found),
+        *why_apart(found),
+        *_caps(found),
+        *busy_variants(found),
+        *([f"{alike}: records/cost.json of a run has what each costs and brings"] if alike else []),
+        *_baseline(found),
+        *_unfinished(records),
+    ]
 
 
 def sweep_records(sweep: Path) -> list[RunRecord]:

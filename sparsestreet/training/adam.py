@@ -1,17 +1,16 @@
 """Adam that leaves a row alone whose gradient is not finite; and one that steps only what the step's view has seen."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.adam import NONE, AdamStep, adam_rows_, adam_step_, finite_rows
+from sparsestreet.ops.adam import NONE, WIDEST_ROW, AdamStep, adam_all_, adam_step_, finite_rows
 
-WIDEST_ROW = 256
-"""Numbers of the widest row that steps or rests as one. In wider ones (a face of the sky) each number is by itself;
-no column of a Gaussian is near it."""
+Table = tuple[Tensor, Tensor, Tensor, Tensor]
+"""A parameter, its gradient, and its moments."""
 
 
 @dataclass(frozen=True)
@@ -53,29 +52,42 @@ class RowAdam(torch.optim.Adam):
             with torch.enable_grad():
                 loss = closure()
         held = [(one, group) for group in self.param_groups for one in group["params"] if one.grad is not None]
-        device = held[0][0].device if held else torch.device("cpu")
-        counts = torch.zeros(len(held), 2, dtype=torch.int64, device=device)
+        counts = torch.zeros(len(held), 2, dtype=torch.int64, device=held[0][0].device if held else "cpu")
         counts[:, 1] = NONE
         self.refused = RefusedRows(tuple(one for one, _ in held), counts)
-        for (parameter, group), refused in zip(held, counts, strict=True):
-            state = self.state[parameter]
-            if not state:
-                state["step"] = torch.zeros((), dtype=torch.float32)
-                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
-            state["step"] += 1
-            step = AdamStep(int(state["step"]), group["lr"], tuple(group["betas"]), group["eps"])
-            self._update(parameter, parameter.grad, (state["exp_avg"], state["exp_avg_sq"]), refused, step)
+        if held:
+            states = [(one, self._state_of(one)) for one, _ in held]
+            tables = [(one, one.grad, state["exp_avg"], state["exp_avg_sq"]) for one, state in states]
+            self._update(tables, counts, _steps([state["step"] for _, state in states], [group for _, group in held]))
         return loss
 
-    def _update(
-        self, parameter: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor], refused: Tensor, step: AdamStep
-    ) -> None:
-        """One parameter's step in place; ``refused``: as in ``adam_rows_``."""
-        adam_rows_(parameter, gradient, *moments, refused, step, width=_width(parameter))
+    def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+        return state
+
+    def _update(self, tables: Sequence[Table], refused: Tensor, steps: Sequence[AdamStep]) -> None:
+        """Step all parameters in place; ``refused``: as in ``adam_all_``."""
+        parameters, gradients, first, second = zip(*tables, strict=True)
+        adam_all_(parameters, gradients, first, second, refused, steps, [_width(one) for one in parameters])
+
+
+def _steps(counts: list[Tensor], groups: Sequence[dict[str, Any]]) -> list[AdamStep]:
+    """Count a step of each parameter; its numbers."""
+    # One operation for all, and one that reads them.
+    torch._foreach_add_(counts, 1)  # pyright: ignore[reportPrivateImportUsage]
+    return [
+        AdamStep(int(count), group["lr"], tuple(group["betas"]), group["eps"])
+        for count, group in zip(torch.stack(counts).tolist(), groups, strict=True)
+    ]
 
 
 def _width(parameter: Tensor) -> int:
-    width = parameter[0].numel() if parameter.dim() and len(parameter) else 1
+    """Numbers of an entry of the first dimension. In one above WIDEST_ROW (a face of the sky) each number is by itself;
+    no column of a Gaussian is near it."""
+    width = parameter.shape[1:].numel()
     return width if 0 < width <= WIDEST_ROW else 1
 
 
@@ -92,11 +104,10 @@ class VisibleAdam(RowAdam):
     ``step`` counts the steps at which the parameter had a gradient at all (see AdamStep.count).
     """
 
-    def _update(
-        self, parameter: Tensor, gradient: Tensor, moments: tuple[Tensor, Tensor], refused: Tensor, step: AdamStep
-    ) -> None:
-        steps = seen_rows(gradient) & finite_rows(gradient, refused)
-        adam_step_(parameter, gradient, *moments, steps, step)
+    def _update(self, tables: Sequence[Table], refused: Tensor, steps: Sequence[AdamStep]) -> None:
+        for (parameter, gradient, first, second), counts, step in zip(tables, refused, steps, strict=True):
+            seen = seen_rows(gradient) & finite_rows(gradient, counts)
+            adam_step_(parameter, gradient, first, second, seen, step)
 
 
 def seen_rows(gradient: Tensor) -> Tensor:

@@ -10,7 +10,8 @@ from torch import Tensor
 from sparsestreet.data.images import WHITE
 from sparsestreet.ops import splat
 from sparsestreet.ops.activate import activate
-from sparsestreet.ops.ssim import ssim
+from sparsestreet.ops.photometric import photometric
+from sparsestreet.ops.pixel_losses import depth_error, sky_entropy
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.types import Frame
@@ -41,13 +42,9 @@ class Photometric(Loss):
     """Level of 255 from which a recorded channel is a lower bound; None: none is (DriveStudio's loss)."""
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
-        rgb, truth = rendering.rgb, frame.image.to(rendering.rgb.dtype) / 255
-        if self.white is not None:
-            rgb = torch.where(frame.image >= self.white, torch.minimum(rgb, truth), rgb)
-        error = (rgb - truth).abs().mean()
-        if self.lambda_dssim > 0:
-            error = (1 - self.lambda_dssim) * error + self.lambda_dssim * (1 - ssim(rgb, truth))
-        return self.weight * error
+        return photometric(
+            rendering.rgb, frame.image, lambda_dssim=self.lambda_dssim, white=self.white, weight=self.weight
+        )
 
 
 def without_hood(rendering: SceneRendering, frame: Frame) -> tuple[SceneRendering, Frame]:
@@ -107,11 +104,7 @@ class SkyMask(Loss):
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         assert frame.sky is not None  # it applies
-        right = torch.where(frame.sky, 1 - rendering.alpha, rendering.alpha)
-        if self.floor is not None:
-            # The value of the clamped number with the gradient of the number itself.
-            right = right + (self.floor - right.detach()).relu()
-        return -self.weight * ((right + self.eps) / (1 + self.eps)).log().mean()
+        return sky_entropy(rendering.alpha, frame.sky, weight=self.weight, eps=self.eps, floor=self.floor)
 
 
 @dataclass(frozen=True)
@@ -132,13 +125,11 @@ class Depth(Loss):
 
     def __call__(self, rendering: SceneRendering, frame: Frame, scene: SceneGraph) -> Float[Tensor, ""]:
         assert frame.depth is not None  # it applies
-        measured, rendered = frame.depth, rendering.depth
         least = self.nearest if self.nearest_rendered is None else self.nearest_rendered
-        valid = (measured > self.nearest) & (measured < self.farthest) & (rendered > least)
-        # Over all pixels, because picking the valid ones would wait for a device; 1 m stands where none is.
-        rendered, measured = torch.where(valid, rendered, 1.0), torch.where(valid, measured, 1.0)
-        error = 1 / rendered - 1 / measured if self.inverse else rendered - measured
-        return self.weight * (error.abs().sum() / valid.sum().clamp(min=1))
+        return depth_error(
+            rendering.depth, frame.depth, weight=self.weight, nearest=self.nearest, farthest=self.farthest,
+            nearest_rendered=least, inverse=self.inverse,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

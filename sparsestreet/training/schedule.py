@@ -100,9 +100,7 @@ class Interval:
         """Whether the event happens after ``step`` (1 is the first)."""
         begun = step >= course.step_at(self.start) - ROUNDING
         before, now = (((step - back) * course.images_per_step - self.shift) // self.every for back in (1, 0))
-        # The first one comes a whole period after the shift.
-        recurs = now > before and (now > 0 or self.shift == 0)
-        return begun and step <= self.last(course) and recurs
+        return begun and step <= self.last(course) and now > before
 
     def closes(self, step: int, course: Course) -> bool:
         """Whether ``step`` is the last one inside the interval."""

@@ -44,7 +44,7 @@ from tests.typed import there
         (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of one_schedule"),
         (["experiment=rule"], "experiment/rule holds several options: choose one of importance, lightgaussian"),
         (["density=gradient"], "did you mean density@node.background.density or density@node.rigid.density? Its opt"),
-        (["render=fast"], "set one of render.backend, render.preset, render.settings"),
+        (["render=fast"], "set one of render.backend, render.replay, render.preset, render.settings"),
         (["trainer.max_step=5"], "did you mean 'schedule.max_steps'?"),  # which that one follows
         (["steps=60"], "did you mean 'schedule.max_steps'?"),
         (["llr=0.1"], "no key 'llr'; sparsestreet train --cfg job prints all"),

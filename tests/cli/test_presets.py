@@ -64,6 +64,7 @@ ALL = {
     "schedule.refine_in.start": at(501),  # warmup_steps 500, exclusive
     "schedule.refine_in.stop": 1.0,
     "schedule.densify_until": at(14_999),  # stop_split_at 15000, exclusive
+    "schedule.reset_in.start": at(501),  # the same
     "schedule.reset_in.shift": 100,
     "schedule.reset_in.stop": 1.0,
     "schedule.pause_after_reset": None,
@@ -207,9 +208,15 @@ def test_resets_come_at_the_steps_of_upstream():
     callbacks = recipe_of(composed("preset=drivestudio", "method=streetgs", *FULL)).callbacks
     interval = as_a(DensityControl, callbacks["density_control"]).reset_in
     assert isinstance(interval, Interval)
-    resets = [step for step in range(30_001) if interval.due(step, Course(30_000))]
-    assert resets == [3_100, 6_100, 9_100, 12_100, 15_100, 18_100, 21_100, 24_100, 27_100]
-    assert not any(interval.due(step, Course(2_000)) for step in range(2_001))
+
+    def resets(steps: int) -> list[int]:
+        return [step for step in range(1, steps + 1) if interval.due(step, Course(steps))]
+
+    assert resets(30_000) == [3_100, 6_100, 9_100, 12_100, 15_100, 18_100, 21_100, 24_100, 27_100]
+    # Its code: step > warm-up and step % 3,000 == 100. The scaled warm-up is 33.3 steps of 2,000 and 100 of 6,000.
+    assert resets(2_000) == [100]
+    assert resets(5_900) == [100, 3_100]
+    assert resets(6_000) == [3_100]
 
 
 @pytest.mark.slow

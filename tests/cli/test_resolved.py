@@ -184,11 +184,10 @@ def test_each_scene_has_its_window(name, published):
         (["protocol=omnire", "data.log.scene=123_456"], "and 123456 is none of them: name one of conf"),
         (["protocol=streetgs", "data.log.scene=7"], "for 8 scenes, and 7 is none of them: name one of conf/protocol"),
         (["protocol=drivestudio_kitti", "data.log.drive=2011_09_26_drive_0002"], "drive_0002 is none of them"),
-        (
-            ["+sweep=table5_ablation"],
-            "and none is 'x': rename the folder to the drive's number, or say data.log.first",
-        ),
-        (["+sweep=table5_ablation", "data.root=a/39"], "and none is '39': rename the folder"),
+        (["+sweep=table5_ablation"], "172, 552, 788, and none is 'x': say data.log.first"),
+        (["+sweep=table5_ablation", "data.root=a/39"], "and none is '39': say data.log.first"),
+        (["+sweep=table5_ablation", "data=kitti", "data.root=a/23"], "and none is '23/': say"),
+        (["+sweep=table5_ablation", "data=pandaset", "data.log.scene=23"], "and none is 'x/23': say"),
     ],
 )
 def test_a_drive_without_a_window_is_an_error_and_not_read_whole(words, said):
@@ -197,6 +196,31 @@ def test_a_drive_without_a_window_is_an_error_and_not_read_whole(words, said):
         str(composed(*words).data.log.last_frame)
     log = composed(*words, "data.log.first_frame=3", "data.log.last_frame=9").data.log
     assert (log.first_frame, log.last_frame) == (3, 9)
+
+
+def table_of_waymo(*words: str) -> tuple[object, ...]:
+    log = composed("+sweep=table1_waymo", *words).data.log
+    return log.first_frame, log.last_frame, log.width, log.cameras, log.lidar_ahead
+
+
+def test_a_table_takes_a_drive_by_what_its_log_says_and_not_by_its_folder(tmp_path):
+    """The same protocol of DriveStudio's folder and of Waymo's files, whose folder says nothing, or another number."""
+    names = ["1382515516588059826_780_000_800_000", "9653249092275997647_980_000_1000_000"]
+    for name, folder in zip(names, ("788", "segments"), strict=True):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"segment-{name}_with_camera_labels.tfrecord").touch()
+    assert table_of_waymo("data.root=a/172") == (30, 180, 960, [0, 1, 2], [-2, 80])
+    waymo = ["data=waymo", f"data.root={tmp_path}/788"]
+    assert table_of_waymo(*waymo) == (30, 180, 960, None, [-2, 80])
+    assert table_of_waymo("data=waymo", f"data.root={tmp_path}/segments")[:2] == (130, -1)
+    (tmp_path / "list.txt").write_text("\n".join(names))
+    # Hydra reads the name of a segment as a number; a number is a place in the list.
+    for scene in (names[0], "0", f"'{names[0]}'"):
+        assert table_of_waymo(*waymo, f"data.log.scene={scene}", f"data.log.scenes={tmp_path}/list.txt")[0] == 30
+    mine = table_of_waymo("data=waymo", f"data.root={tmp_path}/788", f"+data.drives.mine=[{names[0]},5,9]")
+    assert mine[:2] == (30, 180)
+    other = ["data=nuscenes", "data.root=x", "data.log.first_frame=0", "data.log.last_frame=9"]
+    assert table_of_waymo(*other) == (0, 9, 800, ["CAM_FRONT", "CAM_FRONT_LEFT", "CAM_FRONT_RIGHT"], None)
 
 
 @pytest.mark.parametrize("name", PROTOCOLS)

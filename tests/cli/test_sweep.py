@@ -6,10 +6,10 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.commands.jobs import SweepCount, count_jobs
+from sparsestreet.cli.commands.jobs import JobComposer, SweepCount, count_jobs
 from sparsestreet.cli.commands.jobs import jobs as jobs_command
 from sparsestreet.cli.commands.train import train
-from sparsestreet.cli.config.compose import CONF
+from sparsestreet.cli.config.compose import CONF, as_typed
 from sparsestreet.cli.config.validate import config_problem
 from sparsestreet.cli.runs import sweep
 from sparsestreet.cli.runs.sweep import (
@@ -223,3 +223,20 @@ def test_a_job_that_cannot_be_ends_a_sweep_before_its_first_training(capsys):
 def test_jobs_of_the_command_line_are_counted(capsys):
     assert count_jobs(["-m"], ["sparsify=none,removal", "seed=0"]) == [SweepCount("-m", 2, 0, 0.0)]
     assert jobs_command(["sparsify=none"]) == 2
+
+
+@pytest.mark.lengthy
+def test_drives_of_a_file_are_counted_as_if_each_were_composed(tmp_path, monkeypatch):
+    """Jobs that differ in drive and seed are composed once; the second drive has no window, so it shares nothing."""
+    names = ["23", "a drive, with a comma", "114"]
+    (tmp_path / "drives.txt").write_text(f"{tmp_path / names[0]}  # the first\n\n" + "\n".join(
+        str(tmp_path / name) for name in names[1:]
+    ))  # fmt: skip
+    words = as_typed([f"data.root=@{tmp_path / 'drives.txt'}", "seed=0,1"])
+    found = count_jobs(["table3_pruning"], words)
+    monkeypatch.setattr(JobComposer, "_like", lambda *_: None)
+    assert found == count_jobs(["table3_pruning"], words)
+    (counted,) = found
+    # Of two drives and seeds the second arm begins at 0.93334 of the first.
+    assert (counted.jobs, counted.shared) == (12, pytest.approx(4 * 0.93334))
+    assert as_typed(["data.root=@nothing"]) == ["data.root=@nothing"]  # no file: it is no folder either

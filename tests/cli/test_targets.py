@@ -54,7 +54,7 @@ WRAPPED: list[Callable[[dict[str, Any]], Any]] = [
     lambda part: {"_target_": "sparsestreet.evaluation.extra.ExtraMetrics", "novel": [1, part]},
     lambda part: {**part, "_target_": "${name}"},
     lambda part: {**part, "_target_": ["os", "system"]},
-    lambda part: "${by_drive:{1: {_target_: os.mkdir, path: " + "x" + "}}}",
+    lambda part: "${of_reader:{1: {_target_: os.mkdir, path: " + "x" + "}}}",
     lambda part: "${oc.create:'{_target_: os.mkdir}'}",
     lambda part: "${oc.env:HOME}",
     lambda part: "${${name}:HOME}",
@@ -202,6 +202,7 @@ def test_words_of_a_received_run_begin_no_sweep(tmp_path, monkeypatch):
     assert len(asked) == 1
 
 
+@pytest.mark.lengthy
 def test_what_the_user_says_now_is_the_users(tmp_path, capsys):
     part = "++loss.mine={_target_:tests.cli.toy.loss.MeanColor,weight:0.1}"
     run = received(tmp_path / "run", "seed=3", part, "logger=wandb", "++trainer.accumulate_grad_batches=2")

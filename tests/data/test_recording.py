@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
@@ -13,9 +14,10 @@ from scipy.spatial.transform import Rotation
 from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.log_warnings import log_warnings
+from sparsestreet.data.poses import PosePath
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.recorded_images import RecordedImage
-from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, log_of
+from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording, ahead_only, log_of
 from sparsestreet.data.rig import RigCamera, lens_camera, rig_camera
 from sparsestreet.geometry.boxes import box_at
 from sparsestreet.geometry.lenses import Fisheye, Lens, Rational
@@ -263,6 +265,34 @@ def boxes(frames: tuple[int, ...] = tuple(range(PLAN.num_frames)), stamps: tuple
 
 def read(**changes) -> DrivingLog:
     return log_of(recording(**changes), cache_bytes=10**6, check=list)
+
+
+def test_returns_ahead_of_the_vehicle():
+    """By the car's own place at each sweep; a log that knows no vehicle says that nothing is cut."""
+    stamps = [int(stamp) for stamp in PLAN.stamps]
+    path = PosePath(torch.tensor(stamps), torch.from_numpy(PLAN.world_from_vehicle(PLAN.stamps)))
+    cut, everything = ahead_only(recording(vehicle=path), (-3.0, 11)), recording()
+    kept = []
+    for frame in range(PLAN.num_frames):
+        points = there(everything.sweeps)[frame].read().numpy()
+        x = moved(np.linalg.inv(PLAN.world_from_vehicle(stamps[frame])), points)[:, 0]
+        expected = points[(x > -3) & (x < 11)]
+        np.testing.assert_array_equal(there(cut.sweeps)[frame].read().numpy(), expected)
+        kept.append(len(expected) / len(points))
+    assert 0 < min(kept) <= max(kept) < 0.8
+    # Sweeps of their own instants, one of them before the first pose: the vehicle is where it is known next.
+    moments = {frame: stamp + 30_000_000 * (frame - 1) for frame, stamp in enumerate(stamps)}
+    timed = recording(
+        vehicle=replace(path, stamps=path.stamps[1:], poses=path.poses[1:]),
+        sweeps={frame: LidarSweep(partial(sweep, frame), stamp) for frame, stamp in moments.items()},
+    )
+    for frame, stamp in moments.items():
+        nearest = torch.tensor([stamp]).clamp(stamps[1], stamps[-1])
+        x = moved(np.linalg.inv(path.at(nearest)[0].numpy()), sweep(frame).numpy())[:, 0]
+        found = there(ahead_only(timed, (-3.0, 11)).sweeps)[frame].read()
+        assert torch.equal(found, sweep(frame)[torch.from_numpy((x > -3) & (x < 11))])
+    for parts, why in (({}, "the log does not tell where its vehicle was"), ({"sweeps": None}, "no lidar is read")):
+        assert ahead_only(recording(**parts), (-2, 80)).notes == (f"lidar_ahead=[-2, 80] has no effect: {why}",)
 
 
 LAST = 3 * PLAN.period + LEFT.delay

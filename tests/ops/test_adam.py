@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from sparsestreet.ops.adam import NONE, AdamStep, adam_rows_, adam_step_
+from sparsestreet.ops.adam import NONE, AdamStep, adam_all_, adam_step_
 from sparsestreet.ops.backend import has_triton
 from sparsestreet.ops.cpu.library import load_library
 from tests.ops.scenes import device_of, relative_error
@@ -50,10 +50,16 @@ def theirs(start: Tensor, gradients: list[Tensor], kind: Any = torch.optim.Adam,
     return parameter.detach(), state["exp_avg"], state["exp_avg_sq"]
 
 
+def adam_one_(fields: Fields, gradient: Tensor, refused: Tensor, step: AdamStep, width: int, **how: str) -> None:
+    """``adam_all_`` of one parameter."""
+    parameter, first, second = ([field] for field in fields)
+    adam_all_(parameter, [gradient], first, second, refused[None], [step], [width], **how)
+
+
 def of_finite_rows(fields: Fields, gradient: Tensor, step: AdamStep, backend: str) -> None:
     parameter, refused = fields[0], nothing_refused(gradient.device)
     width = parameter[:1].numel()
-    adam_rows_(parameter, gradient, *fields[1:], refused, step, width=width, backend=backend)
+    adam_one_(fields, gradient, refused, step, width, backend=backend)
     assert refused.tolist() == [0, NONE]
 
 
@@ -108,7 +114,7 @@ def test_rows_whose_gradient_is_not_finite_keep_every_bit_and_are_counted(shape,
     results = []
     for given, counted in ((gradient, [3, 5]), (clean, [0, NONE])):
         fields, refused = [field.clone() for field in before], nothing_refused(start.device)
-        adam_rows_(fields[0], given, fields[1], fields[2], refused, AdamStep(3, LR), width=width, backend=backend)
+        adam_one_((fields[0], fields[1], fields[2]), given, refused, AdamStep(3, LR), width, backend=backend)
         assert refused.tolist() == counted
         results.append(fields)
     others = torch.ones(rows, dtype=torch.bool, device=start.device).index_fill(0, bad, False)
@@ -118,13 +124,84 @@ def test_rows_whose_gradient_is_not_finite_keep_every_bit_and_are_counted(shape,
         assert torch.equal(found[others], wanted[others])
 
 
+WIDTHS = 5 * (3, 1, 45, 4, 256, 7, 130)
+ROWS = 5 * (345, 1, 23, 1024, 9, 0, 8)
+"""Of each width: programs that are full, or end in numbers of no 16 bytes, and none; more parameters than a table has
+places at least."""
+
+
+def several(device: torch.device, offset: int = 0) -> tuple[list[Tensor], list[Tensor], list[AdamStep]]:
+    """Parameters of all widths and their gradients, with rows that are not finite; all but the first begin ``offset``
+    numbers behind a multiple of 64 bytes."""
+    generator = torch.Generator().manual_seed(4)
+    made = []
+    for rows, width in zip(2 * ROWS, 2 * WIDTHS, strict=True):
+        room = torch.zeros(rows * width + offset, device=device)
+        made.append(room[offset * (len(made) > 0) :][: rows * width].view(rows, width))
+        made[-1].copy_(torch.randn(rows, width, generator=generator))
+    parameters, gradients = made[: len(WIDTHS)], made[len(WIDTHS) :]
+    for place, value in enumerate((torch.nan, torch.inf, -torch.inf, torch.nan)):
+        gradients[place][-1 - place // 2, -1] = value
+    gradients[3][700:702, 0] = torch.nan
+    return parameters, gradients, [AdamStep(1 + place, 0.1 + place, BETAS, EPS) for place in range(len(WIDTHS))]
+
+
+@every_backend
+@pytest.mark.parametrize("offset", [0, 1])
+def test_parameters_step_together_each_by_its_own_numbers(backend, offset):
+    parameters, gradients, steps = several(device_of(backend), offset)
+    before = [one.double() for one in parameters]
+    first, second = [[torch.full_like(one, value) for one in parameters] for value in (0.25, 0.5)]
+    refused = torch.tensor([[2, NONE]], device=device_of(backend)).repeat(len(WIDTHS), 1)
+    adam_all_(parameters, gradients, first, second, refused, steps, WIDTHS, backend=backend)
+    bad = [~gradient.isfinite().all(1) for gradient in gradients]
+    firsts = [int(rows.nonzero()[0]) if bool(rows.any()) else NONE for rows in bad]
+    assert refused.tolist() == [[2 + int(rows.sum()), row] for rows, row in zip(bad, firsts, strict=True)]
+    for place, (step, old, gradient) in enumerate(zip(steps, before, gradients, strict=True)):
+        m = 0.25 * BETAS[0] + (1 - BETAS[0]) * gradient.double()
+        v = 0.5 * BETAS[1] + (1 - BETAS[1]) * gradient.double() ** 2
+        root = (v / (1 - BETAS[1] ** step.count)).sqrt() + EPS
+        rested = bad[place][:, None]
+        wanted = (torch.where(rested, *pair) for pair in (
+            (old, old - step.lr * m / (1 - BETAS[0] ** step.count) / root),
+            (torch.full_like(old, 0.25), m), (torch.full_like(old, 0.5), v),
+        ))  # fmt: skip
+        for found, truth in zip((parameters[place], first[place], second[place]), wanted, strict=True):
+            # A few roundings of numbers that are no larger than a step and the parameter.
+            torch.testing.assert_close(found.double(), truth, rtol=1e-6, atol=1e-6 * step.lr)
+
+
+@pytest.mark.skipif(not has_triton(), reason="needs the package triton")
+def test_a_launch_is_played_back_with_other_numbers(monkeypatch):
+    """What a recorded copy and launch read again is the memory of the host that ``fill`` writes."""
+    from sparsestreet.ops.triton import adam
+
+    launched, launch = [], adam.launch
+    monkeypatch.setattr(adam, "launch", lambda *given, **options: launched.append((given, options)))
+    device = device_of("triton")
+    parameters, gradients, steps = several(device)
+    first, second, others, more = [[torch.zeros_like(one) for one in parameters] for _ in range(4)]
+    fresh, refused = [one.clone() for one in parameters], nothing_refused(device).repeat(len(WIDTHS), 1)
+    tables = adam.AdamTables(parameters, gradients, first, second, refused, WIDTHS)
+    tables.fill([AdamStep(9, 5.0).numbers] * len(WIDTHS))
+    tables.launch()
+    tables.fill([step.numbers for step in steps])
+    (((kernel, items, block, table, *rest), options),) = launched
+    table.copy_(tables.host)
+    launch(kernel, items, block, table, *rest, **options)
+    monkeypatch.setattr(adam, "launch", launch)
+    adam_all_(fresh, gradients, others, more, refused, steps, WIDTHS, backend="triton")
+    assert all(map(torch.equal, parameters, fresh))
+    assert not any(isinstance(one, float) for one in rest)
+
+
 @every_backend
 def test_counts_add_up_and_the_first_row_stays_the_first(backend):
     start, (gradient, *_) = inputs((9, 3), device_of(backend))
     gradient[7] = torch.nan
     refused = torch.tensor([4, 2], device=start.device)
     moments = torch.zeros_like(start), torch.zeros_like(start)
-    adam_rows_(start, gradient, *moments, refused, AdamStep(1, LR), width=3, backend=backend)
+    adam_one_((start, *moments), gradient, refused, AdamStep(1, LR), 3, backend=backend)
     assert refused.tolist() == [5, 2]
 
 
@@ -133,7 +210,7 @@ def test_huge_numbers_are_finite_and_none_at_all_is_no_error():
     for backend in ("torch", "cpu"):
         of_finite_rows((torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 3)), gradient, AdamStep(1, LR), backend)
     empty, refused = torch.zeros(0, 3), nothing_refused(gradient.device)
-    adam_rows_(empty, empty, empty, empty, refused, AdamStep(1, LR), width=3)
+    adam_one_((empty, empty, empty), empty, refused, AdamStep(1, LR), 3)
     assert refused.tolist() == [0, NONE]
 
 
@@ -221,8 +298,8 @@ def test_a_graph_of_older_values_refuses_its_backward_pass(update, backend):
 def test_shapes_that_do_not_fit():
     start, refused = torch.zeros(6, 6), nothing_refused(torch.device("cpu"))
     with pytest.raises(ValueError, match="one shape"):
-        adam_rows_(start, start[:3], start, start, refused, AdamStep(1, LR), width=6)
+        adam_one_((start, start, start), start[:3], refused, AdamStep(1, LR), 6)
     with pytest.raises(ValueError, match="36 numbers do not come in rows of 5"):
-        adam_rows_(start, start, start, start, refused, AdamStep(1, LR), width=5)
+        adam_one_((start, start, start), start, refused, AdamStep(1, LR), 5)
     with pytest.raises(ValueError, match="one shape"):
         adam_step_(start, start, start[:, :2], start, torch.ones(6, dtype=torch.bool), AdamStep(1, LR))

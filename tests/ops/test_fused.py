@@ -8,12 +8,15 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from sparsestreet.geometry.trajectories import Trajectories
 from sparsestreet.ops import backend as fused
 from sparsestreet.ops.activate import activate
-from sparsestreet.ops.adam import AdamStep, adam_rows_
+from sparsestreet.ops.adam import AdamStep, adam_all_
 from sparsestreet.ops.backend import fused_backend
+from sparsestreet.ops.photometric import photometric
+from sparsestreet.ops.pixel_losses import depth_error, sky_entropy
 from sparsestreet.ops.poses import poses_at
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.ops.sky import over_sky
 from sparsestreet.ops.ssim import ssim
+from sparsestreet.ops.statistics import add_view_
 from sparsestreet.types import Camera
 
 MEANS, SCALES, TURNS, OPACITIES, DC, REST = (torch.zeros(1, *shape) for shape in ((3,), (3,), (4,), (), (1, 3), (0, 3)))
@@ -24,12 +27,8 @@ TRACKS = Trajectories(
 IMAGE = torch.zeros(11, 11, 3)
 CAMERA = Camera(torch.eye(4), torch.eye(3), width=11, height=11)
 STEPS = {
-    "adam": lambda backend: adam_rows_(
-        *(torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 3), torch.zeros(2, 3)),
-        torch.zeros(2).long(),
-        AdamStep(1, 0.1),
-        width=3,
-        backend=backend,
+    "adam": lambda backend: adam_all_(
+        [MEANS], [MEANS], [MEANS], [MEANS], torch.zeros(1, 2).long(), [AdamStep(1, 0.1)], [3], backend=backend
     ),
     "activate": lambda backend: activate([ROWS], sh_degree=0, backend=backend),
     "poses": lambda backend: poses_at(TRACKS, torch.zeros(1, 1, 3), torch.zeros(1, 1, 3), 0.0, 0.1, backend=backend),
@@ -37,12 +36,22 @@ STEPS = {
         IMAGE, IMAGE[..., 0], torch.zeros(6, 1, 1, 3), CAMERA, transmittance_min=0.1, backend=backend
     ),
     "ssim": lambda backend: ssim(IMAGE, IMAGE, backend=backend),
+    "photometric": lambda backend: photometric(IMAGE, IMAGE.to(torch.uint8), lambda_dssim=0.2, backend=backend),
+    "depth": lambda backend: depth_error(IMAGE[..., 0], IMAGE[..., 0], backend=backend),
+    "alpha": lambda backend: sky_entropy(IMAGE[..., 0], IMAGE[..., 0].bool(), backend=backend),
+    "statistics": lambda backend: add_view_(
+        OPACITIES, OPACITIES.long(), OPACITIES, MEANS[:, :2], OPACITIES, (2, 2), backend=backend
+    ),
 }
 PLACES = {
-    "adam": {"cpu": "adam._step_in_library_", "triton": "triton.adam.step_finite_rows_"},
+    "adam": {"cpu": "adam._step_in_library_", "triton": "triton.adam.AdamTables.launch"},
     "activate": {"cpu": "cpu.rows.activate", "triton": "triton.activate.activate"},
     "poses": {"cpu": "cpu.rows.poses_at", "triton": "triton.poses.poses_at"},
     "sky": {"cpu": "cpu.images.over_sky", "triton": "triton.sky.over_sky"},
+    "statistics": {"cpu": "statistics._add_in_library_", "triton": "triton.statistics.add_view_"},
+    "photometric": {"cpu": "cpu.images.compare", "triton": "triton.photometric.compare"},
+    "depth": {"cpu": "pixel_losses._mean_in_library_", "triton": "triton.pixel_losses.mean_of_"},
+    "alpha": {"cpu": "pixel_losses._mean_in_library_", "triton": "triton.pixel_losses.mean_of_"},
     "ssim": {"cpu": "cpu.images.mean_ssim", "triton": "triton.ssim.mean_ssim"},
 }
 """Where each implementation lies in sparsestreet.ops."""

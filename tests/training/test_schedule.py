@@ -33,10 +33,12 @@ def test_what_recurs_counts_images(images, shift):
     assert several == [math.ceil(step / images) for step in single]
 
 
-@pytest.mark.parametrize(("shift", "first"), [(0, 20), (7, 27)])
-def test_the_first_comes_a_whole_period_after_the_shift(shift, first):
-    interval = Interval(0.0, 1.0, every=20, shift=shift)
-    assert [step for step in range(1, 70) if interval.due(step, Course(100))] == [first, first + 20, first + 40]
+@pytest.mark.parametrize(
+    ("start", "shift", "first"), [(0.0, 0, 20), (0.0, 7, 7), (0.07, 7, 7), (0.08, 7, 27), (0.27, 7, 27)]
+)
+def test_the_first_comes_at_the_shift_or_where_the_interval_has_begun(start, shift, first):
+    interval = Interval(start, 1.0, every=20, shift=shift)
+    assert [step for step in range(1, first + 42) if interval.due(step, Course(100))] == [first, first + 20, first + 40]
 
 
 @pytest.mark.parametrize("steps", [7, 60, 100, 700, 2000, 30000])

@@ -157,14 +157,26 @@ def as_typed(arguments: Sequence[str]) -> list[str]:
     """The arguments, with quotes of Hydra's around a value that its grammar reads as something else than was typed.
 
     A shell takes its own quotes away, so a folder's name comes with its spaces, commas and letters alone. Lists of a
-    sweep stay lists, unless there is a file of the whole name.
+    sweep stay lists, unless there is a file of the whole name. ``data.root=@FILE`` is the list of folders that a file
+    names, one a line, since Linux takes no argument above 128 KiB; what follows # is a comment.
     """
     several = bool({"-m", "--multirun"} & set(arguments))
     return [_as_typed(text, several) for text in arguments]
 
 
+_DRIVES = "data.root"
+
+
+def _lines(path: Path) -> list[str]:
+    """Return what the lines of a file name; nothing where there is no file."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    return [name for line in lines if (name := line.partition("#")[0].strip())]
+
+
 def _as_typed(text: str, several: bool) -> str:
     key, equals, value = text.partition("=")
+    if key == _DRIVES and value.startswith("@") and (listed := _lines(Path(value[1:]))):
+        return f"{key}={','.join(map(quoted, listed))}"
     if text.startswith("-") or not equals or not value or value[0] + value[-1] in ("''", '""') or "${" in value:
         return text
     path = key in PATHS

@@ -126,19 +126,33 @@ _NO_OTHER = object()
 _SAY_FRAMES = "say data.log.first_frame=N data.log.last_frame=N (0 and -1: all frames)"
 
 
-def by_drive(values: Mapping[Any, Any], otherwise: Any = _NO_OTHER, *, _root_: DictConfig) -> Any:
-    """Of conf/sweep: the entry of the drive whose folder is ``data.root``, by the number that is its name.
+def by_drive(part: int, *, _root_: DictConfig) -> Any:
+    """Return, for conf/sweep, a part of the entry of ``data.drives`` whose drive is read: 1 first frame, 2 last one.
 
-    Raises ValueError for a folder without an entry, where there is nothing else: it would be read whole, unsaid.
+    A drive is known by what the log says it is. Raises ValueError for one without an entry: it would be read whole,
+    unsaid.
     """
-    name = Path(_root_.data.root).name
-    found = values.get(int(name), otherwise) if name.isdigit() else otherwise
-    if found is _NO_OTHER:
-        raise ValueError(
-            f"this table's windows of frames are those of drives {', '.join(map(str, values))}, by the names of their "
-            f"folders, and none is {name!r}: rename the folder to the drive's number, or {_SAY_FRAMES}"
-        )
-    return found
+    drives, found = _root_.data.drives, _said_drive(_root_.data)
+    for number, (name, *_) in drives.items():
+        if found.replace("_", "") in (number, name.replace("_", "")):
+            return drives[number][part]
+    raise ValueError(
+        f"this table has windows of frames for drives {', '.join(drives)}, and none is {found!r}: {_SAY_FRAMES}"
+    )
+
+
+def _said_drive(data: DictConfig) -> str:
+    """DriveStudio's folder says its number, a segment of Waymo its name, others the scene that is named."""
+    log, said = data.log, _scene(data.log)
+    reader = log._target_.rpartition(".")[2]
+    if reader == "WaymoReader":
+        from sparsestreet.data.waymo import segment_name  # torch, which a report needs not
+
+        return segment_name(Path(data.root), said, log.scenes)
+    if reader == "DriveStudioReader":
+        name = Path(data.root).name
+        return str(int(name)) if name.isdigit() else name
+    return f"{Path(data.root).name}/{'' if said is None else said}"  # neither a number nor a segment's name
 
 
 def by_scene(values: Mapping[Any, Any], otherwise: Any = _NO_OTHER, *, _root_: DictConfig) -> Any:
@@ -148,11 +162,11 @@ def by_scene(values: Mapping[Any, Any], otherwise: Any = _NO_OTHER, *, _root_: D
     Raises ValueError for a scene without an entry, and where none is named, if there is nothing else.
     """
     log = _root_.data.log
-    key = next((key for key in ("scene", "drive", "sequence") if log.get(key) is not None), None)
+    said = _scene(log)
     named = {str(name).replace("_", ""): value for name, value in values.items()}
-    found = otherwise if key is None else named.get(str(log[key]).replace("_", ""), otherwise)
+    found = otherwise if said is None else named.get(str(said).replace("_", ""), otherwise)
     if found is _NO_OTHER:
-        what = "none is named (data.log.scene or data.log.drive)" if key is None else f"{log[key]} is none of them"
+        what = "none is named (data.log.scene or data.log.drive)" if said is None else f"{said} is none of them"
         raise ValueError(
             f"this protocol has windows of frames for {len(values)} scenes, and {what}: name one of conf/protocol, or "
             f"{_SAY_FRAMES}"
@@ -160,13 +174,30 @@ def by_scene(values: Mapping[Any, Any], otherwise: Any = _NO_OTHER, *, _root_: D
     return found
 
 
+def _scene(log: DictConfig) -> Any:
+    """The scene, drive or sequence that is named; None: none is."""
+    return next((log[key] for key in ("scene", "drive", "sequence") if log.get(key) is not None), None)
+
+
+def of_reader(values: Mapping[str, Any], otherwise: Any, *, _root_: DictConfig) -> Any:
+    """Return, for conf/sweep and conf/preset, the value of the log's reader, by the name of its class."""
+    found = values.get(_root_.data.log._target_.rpartition(".")[2], otherwise)
+    return ListConfig(found) if isinstance(found, list) else found  # ``--resolve`` takes no list of Python's
+
+
 def dashed(values: Iterable[Any]) -> str:
     """Of conf/experiment: a list in a name."""
     return "-".join(map(str, values))
 
 
+def drive(*, _root_: DictConfig) -> str:
+    """Return, for conf/sweep, the drive in the name of a run's folder: its log's folder, and a named scene."""
+    said = _scene(_root_.data.log)
+    return Path(_root_.data.root).name + ("" if said is None else f"_{said}")
+
+
 def last_part(path: str) -> str:
-    """Of conf/sweep: the name of a folder."""
+    """Return the name of a folder, for configurations of runs that were written before ``drive``."""
     return Path(path).name
 
 
@@ -211,7 +242,9 @@ _RESOLVERS = {
     "by_drive": by_drive,
     "by_scene": by_scene,
     "dashed": dashed,
+    "drive": drive,
     "last_part": last_part,
+    "of_reader": of_reader,
 }
 
 

@@ -6,7 +6,7 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -63,12 +63,33 @@ def resumed_overrides(arguments: list[str], parts: Sequence[str] = ()) -> list[s
     overrides = read_yaml(source, yaml.safe_load)
     if not isinstance(overrides, list):
         raise ValueError(f"{source} is damaged: it holds no list of options")
-    own = {"resume", "out", "overwrite", *(_key_of(text) for text in arguments)}
-    kept = [text for text in map(str, overrides) if _key_of(text) not in own]
     branches = checkpoint_fraction(Path(given)) is not None
     folder = [] if branches or any(text.startswith("out=") for text in arguments) else [f"out={quoted(str(run))}"]
-    _check_words(kept, without_flags([*arguments, *folder]), source, parts)
-    return [*kept, *arguments, *folder]
+    return [
+        *received_words(map(str, overrides), ("resume", "out", "overwrite"), [*arguments, *folder], source, parts),
+        *arguments,
+        *folder,
+    ]
+
+
+def received_words(
+    words: Iterable[str], left: Iterable[str], typed: list[str], source: Path, parts: Sequence[str] = ()
+) -> list[str]:
+    """The words of a run that came from anybody, without those that are left out or said again in this command.
+
+    Args:
+        words: overrides, as the run has them.
+        left: keys that are left out.
+        typed: the words of the user's own command.
+        source: what is named in an error.
+        parts: modules that the user's command trusts.
+
+    Raises ValueError where they choose what only the user's own words may.
+    """
+    own = {*left, *map(_key_of, typed)}
+    kept = [text for text in words if _key_of(text) not in own]
+    _check_words(kept, without_flags(typed), source, parts)
+    return kept
 
 
 def _check_words(received: list[str], typed: list[str], source: Path, parts: Sequence[str]) -> None:
@@ -278,14 +299,14 @@ def take_folder(cfg: DictConfig, out: Path, goes_on: bool) -> None:
         (out / TRACKS_FILE).unlink(missing_ok=True)
     folder = out / CONFIGURATION
     folder.mkdir(parents=True, exist_ok=True)
-    config = _without_environment(cfg)
+    config = without_environment(cfg)
     said = {"overrides": HydraConfig.get().overrides.task, "hydra": HydraConfig.instance().cfg, "config": config}
     for name, part in said.items():
         with atomic_file(folder / f"{name}.yaml") as temporary:
             OmegaConf.save(part, temporary)
 
 
-def _without_environment(cfg: DictConfig) -> DictConfig:
+def without_environment(cfg: DictConfig) -> DictConfig:
     """What a configuration takes from the environment, as values: of a run that is opened nothing may ask for it."""
     known = cfg.copy()
     for place, value in leaves(OmegaConf.to_container(cfg)):

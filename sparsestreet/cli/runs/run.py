@@ -22,6 +22,7 @@ from sparsestreet.cli.runs.folder import lies_in, moments_to_keep, run_of, start
 from sparsestreet.cli.runs.locks import devices_of_job
 from sparsestreet.cli.runs.tracks import finds, with_tracks, write_tracks
 from sparsestreet.data.datamodule import StreetData
+from sparsestreet.data.log import counted
 from sparsestreet.evaluation.speed import forget_peaks
 from sparsestreet.kept import Kept
 from sparsestreet.phases import StageRecorder, stage
@@ -147,6 +148,7 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
         start = start_of(cfg, out) or start_from_trunk(cfg, out)
     with stages, stage("data"):
         data = data_of(cfg, None if start is None else run_of(start))
+        log.info("%s", _window_of(cfg, data))
     with stages, stage("start"):
         known = with_images(cfg, len(data.split.train))
         # The job's own overrides: in a sweep they are not what was typed.
@@ -173,6 +175,13 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
             stages=stages,
         )
     return 0.0 if summary is None else summary.mean("psnr_full")
+
+
+def _window_of(cfg: DictConfig, data: StreetData) -> str:
+    """Which part of which drive is trained on, in words."""
+    street, window = data.driving_log, [cfg.data.log.get(key) for key in ("first_frame", "last_frame")]
+    said = "" if None in window else ", from {} to {} of the recording".format(*window)
+    return f"log {street.name}: {counted(street.num_frames, 'frame')}{said.replace('to -1', 'to the last')}"
 
 
 def silence_known_noise() -> None:

@@ -33,7 +33,7 @@ from sparsestreet.records.summary import SUMMARY
 log = logging.getLogger(__name__)
 
 _FIXED = "hydra.job.config.override_dirname.exclude_keys"
-_ALIKE = ("seed=", "data.root=")
+ALIKE = ("seed=", "data.root=")
 """Options of a job that no problem of its configuration depends on."""
 _SAID = 10
 """Configurations from which on a sweep says that it looks at them: a second each."""
@@ -110,7 +110,7 @@ def job_problem(arguments: list[str]) -> str | None:
 
     with configuration():
         jobs = list(jobs_of(without_flags(arguments)))
-        once = {tuple(word for word in words if not word.startswith(_ALIKE)): words for words in reversed(jobs)}
+        once = {tuple(word for word in words if not word.startswith(ALIKE)): words for words in reversed(jobs)}
         if len(once) > _SAID:
             print(f"sparsestreet train: looks at {len(once)} configurations before the first run", file=sys.stderr)
         for words in reversed(once.values()):
@@ -151,7 +151,7 @@ def sweep_problem(arguments: list[str]) -> str | None:
         )
     absent = [root for root in ([roots] if Path(roots).is_dir() else roots.split(",")) if not Path(root).is_dir()]
     if absent:
-        return f"data.root names {', '.join(absent)}, which is no folder here: give drives in DriveStudio's layout"
+        return f"data.root names {', '.join(absent)}, which is no folder here: give folders of drives"
     return None
 
 

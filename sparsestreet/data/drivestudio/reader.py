@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import get_args
 
 import torch
 from jaxtyping import Float64
@@ -38,7 +37,7 @@ from sparsestreet.data.images import check_camera_images, image_size
 from sparsestreet.data.log import DrivingLog, SceneExtent, VehiclePath, absence_notes
 from sparsestreet.data.poses import check_extent, dataset_from_world, recentered
 from sparsestreet.data.problems import LogError, Missing, Problem, attempt, check_missing, missing_files, missing_notes
-from sparsestreet.data.reader import FolderSignature, LogFiles, LogReader
+from sparsestreet.data.reader import FolderSignature, LogFiles, LogReader, check_region
 from sparsestreet.data.recording import SceneFolder
 from sparsestreet.data.rig import check_lens
 from sparsestreet.data.tracks import timed_tracks, track_in_window
@@ -148,12 +147,7 @@ class DriveStudioReader(LogReader):
 
     def __post_init__(self) -> None:
         check_missing(self.missing)
-        if self.extent not in get_args(SceneExtent):
-            raise ValueError(f"extent must be one of {', '.join(get_args(SceneExtent))}, got {self.extent!r}")
-        if self.lidar_ahead is not None and not (
-            len(self.lidar_ahead) == 2 and self.lidar_ahead[0] < self.lidar_ahead[1]
-        ):
-            raise ValueError(f"lidar_ahead needs a least and a larger distance, got {self.lidar_ahead}: say [-2, 80]")
+        check_region(self.extent, self.lidar_ahead)
 
     @property
     def folder(self) -> Path:

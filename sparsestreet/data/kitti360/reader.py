@@ -172,6 +172,7 @@ class Kitti360Reader(RecordedReader):
                 recorded_size=camera.size,
                 width=self.width,
                 pinhole_fov=self.pinhole_fov,
+                undistort=self.undistort,
             )
         return self.pinhole(name, index, camera.intrinsics, camera.size)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import get_args
+from typing import ClassVar, get_args
 
 import numpy as np
 import torch
@@ -191,7 +191,10 @@ class NuScenesReader(RecordedReader):
     """Pixels of the recorded images that are added to cx and cy, because here pixel centers are at +0.5. 0 for tables
     whose numbers are counted so already."""
 
+    first_pose_of: ClassVar[str] = "camera"
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.rate not in get_args(Rate):
             raise ValueError(f"rate must be one of {', '.join(get_args(Rate))}, got {self.rate!r}")
         if isinstance(self.scene, bool):

@@ -279,6 +279,7 @@ class RigJsonReader(RecordedReader):
     """skip: images that are listed and have no file are left out with a note, as are frames without any."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_missing(self.missing)
 
     def recording(self) -> Recording:
@@ -337,6 +338,7 @@ class RigJsonReader(RecordedReader):
             recorded_size=entry.size,
             width=self.width,
             pinhole_fov=self.pinhole_fov,
+            undistort=self.undistort,
         )
 
     def _problems(self, part: Part, shots: Sequence[RecordedImage]) -> list[Problem]:

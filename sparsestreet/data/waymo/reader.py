@@ -19,7 +19,7 @@ from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
 from sparsestreet.data.recorded_images import RecordedImage
 from sparsestreet.data.recording import Boxes, LidarSweep, RecordedReader, Recording
-from sparsestreet.data.rig import RigCamera, check_lens, rig_camera
+from sparsestreet.data.rig import RigCamera, Undistortion, check_lens, rig_camera
 from sparsestreet.data.waymo.boxes import camera_at, middle, read_boxes, shutter
 from sparsestreet.data.waymo.segment import (
     REMEDY,
@@ -61,6 +61,11 @@ def find_segments(root: Path) -> dict[str, Path]:
         message = "it holds neither *.tfrecord (version 1) nor component/*.parquet (version 2), up to two folders deep"
         raise fault(root, message, "name the folder that holds Waymo's files (data.root)")
     return records or tables
+
+
+def segment_name(root: Path, scene: str | int | None, scenes: Path | str | None) -> str:
+    """Return the name of the wanted segment; no file is opened. Arguments and errors as of ``find_segment``."""
+    return _wanted(sorted(find_segments(root)), scene, None if scenes is None else Path(scenes), root)
 
 
 def find_segment(root: Path, scene: str | int | None, scenes: Path | None) -> Segment:
@@ -123,9 +128,16 @@ def decode_image(
 
 
 def decode_masks(
-    data: bytes, divisor: int, recorded: tuple[int, int], size: tuple[int, int], path: Path, what: str
+    data: bytes,
+    divisor: int,
+    recorded: tuple[int, int],
+    size: tuple[int, int],
+    path: Path,
+    what: str,
+    undistortion: Undistortion | None = None,
 ) -> dict[str, Bool[Tensor, "h w"]]:
-    """Kind -> mask at ``size``, from a PNG of class * divisor + instance. Raises as ``decode_image``.
+    """Kind -> mask at ``size``, without the lens if told, from a PNG of class * divisor + instance. Raises as
+    ``decode_image``.
 
     Sky takes the nearest pixel; other masks keep every pixel that an object touches, as those of files do.
     """
@@ -138,7 +150,7 @@ def decode_masks(
         if size != recorded:
             way = Image.Resampling.NEAREST if kind == "sky" else Image.Resampling.BILINEAR
             mask = np.array(Image.fromarray(mask).resize(size, way))
-        masks[kind] = torch.from_numpy(mask > 0)
+        masks[kind] = torch.from_numpy((mask if undistortion is None else undistortion(mask)) > 0)
     return masks
 
 
@@ -308,6 +320,7 @@ class WaymoReader(RecordedReader):
                     distortion=distortion,
                     recorded_size=calibration.size,
                     width=self.width,
+                    undistort=self.undistort,
                 )
             )
         return rig
@@ -360,7 +373,9 @@ def _read_image(segment: Segment, rig: Sequence[RigCamera[str]], shot: RecordedI
     camera = rig[shot.camera]
     frame = int(shot.stem)
     data, recorded = segment.jpeg(frame, camera.name), segment.cameras[camera.name].size
-    return decode_image(data, recorded, camera.size, segment.image_file, f"the image of {camera.name} at frame {frame}")
+    what = f"the image of {camera.name} at frame {frame}"
+    pixels = decode_image(data, recorded, camera.size, segment.image_file, what)
+    return pixels if camera.undistortion is None else torch.from_numpy(camera.undistortion(pixels.numpy()))
 
 
 def _read_masks(
@@ -374,10 +389,11 @@ def _read_masks(
     camera, frame = rig[shot.camera], int(shot.stem)
     recorded = segment.cameras[camera.name].size
     if (frame, camera.name) not in labelled:
-        return given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size)
+        take_out = camera.undistortion
+        return given.read(camera.name, shot.stem, recorded_size=recorded, size=camera.size, undistortion=take_out)
     data, divisor = segment.panoptic(frame, camera.name)
     what = f"the panoptic label of {camera.name} at frame {frame}"
-    return decode_masks(data, divisor, recorded, camera.size, segment.label_file, what)
+    return decode_masks(data, divisor, recorded, camera.size, segment.label_file, what, camera.undistortion)
 
 
 def _read_points(segment: Segment, spool: Spool, frame: int) -> Float64[Tensor, "n 3"]:

@@ -1,4 +1,4 @@
-"""Images by the C++ library: the sky behind the splats, and D-SSIM."""
+"""Images by the C++ library: the sky behind the splats, D-SSIM, and the photometric loss around it."""
 
 import itertools
 from ctypes import byref, c_double
@@ -96,32 +96,82 @@ class _MeanSSIM(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, truth, variant):
-        height, width, channels = image.shape
-        kept = 3 if ctx.needs_input_grad[0] else 0
-        partials = image.new_empty(kept, height - WINDOW + 1, width - WINDOW + 1, channels)
-        mean = image.new_empty(())
-        kind = (image.dtype == torch.float64, variant)
-        status = native.load_library().splat_ssim(
-            *kind, byref(_pair(image, truth)), partials.data_ptr() if kept else None, mean.data_ptr()
-        )
-        if status != native.STATUS_OK:
-            raise MemoryError("no memory for the sums of SSIM: compare smaller images")
+        mean, partials = _similarity(image, truth, ctx.needs_input_grad[0], variant)
         ctx.save_for_backward(image, truth, partials)
-        ctx.kind = kind
+        ctx.variant = variant
         return mean
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_mean):
         image, truth, partials = ctx.saved_tensors
-        v_image = torch.empty_like(image)
-        with phase("ssim backward"):
-            native.load_library().splat_ssim_backward(
-                *ctx.kind, byref(_pair(image, truth)), partials.data_ptr(), v_mean.data_ptr(), v_image.data_ptr()
-            )
-        return v_image, None, None
+        return _similarity_gradient(image, truth, partials, v_mean, ctx.variant), None, None
+
+
+def _similarity(image: Tensor, truth: Tensor, keep: bool, variant: int) -> tuple[Tensor, Tensor]:
+    """Return the mean, and if ``keep`` the three derivatives."""
+    height, width, channels = image.shape
+    partials = image.new_empty(3 if keep else 0, height - WINDOW + 1, width - WINDOW + 1, channels)
+    mean = image.new_empty(())
+    status = native.load_library().splat_ssim(
+        image.dtype == torch.float64, variant, byref(_pair(image, truth)), partials.data_ptr() if keep else None,
+        mean.data_ptr(),
+    )  # fmt: skip
+    if status != native.STATUS_OK:
+        raise MemoryError("no memory for the sums of SSIM: compare smaller images")
+    return mean, partials
+
+
+def _similarity_gradient(image: Tensor, truth: Tensor, partials: Tensor, v_mean: Tensor, variant: int) -> Tensor:
+    v_image = torch.empty_like(image)
+    with phase("ssim backward"):
+        native.load_library().splat_ssim_backward(
+            image.dtype == torch.float64, variant, byref(_pair(image, truth)), partials.data_ptr(), v_mean.data_ptr(),
+            v_image.data_ptr(),
+        )  # fmt: skip
+    return v_image
 
 
 def _pair(image: Tensor, truth: Tensor) -> native.CImagePair:
     height, width, _ = image.shape
     return native.CImagePair(image.data_ptr(), truth.data_ptr(), height, width, TAPS, C1, C2, native.thread_count())
+
+
+def compare(
+    image: Tensor, recorded: Tensor, white: int, scale: float, share: float, keep: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the value of ``sparsestreet.ops.photometric``; the image where it counts, the truth in its numbers, and
+    the derivatives of SSIM. Raises MemoryError without room for the sums."""
+    seen, truth, error = torch.empty_like(image), torch.empty_like(image), image.new_empty(())
+    status = native.load_library().splat_colors(
+        image.dtype == torch.float64, FASTEST_VARIANT, byref(_colors(image, recorded, white, scale)),
+        *native.pointers(seen, truth, error),
+    )  # fmt: skip
+    if status != native.STATUS_OK:
+        raise MemoryError("no memory for the sums of L1: compare smaller images")
+    mean, partials = _similarity(seen, truth, keep, FASTEST_VARIANT)
+    return error.add_(1 - mean, alpha=share), seen, truth, partials
+
+
+def compare_backward(
+    image: Tensor,
+    recorded: Tensor,
+    seen: Tensor,
+    truth: Tensor,
+    partials: Tensor,
+    v_value: Tensor,
+    white: int,
+    scale: float,
+    share: float,
+) -> Tensor:
+    """Return the gradient of the image."""
+    v_image = _similarity_gradient(seen, truth, partials, v_value * -share, FASTEST_VARIANT)
+    native.load_library().splat_colors_backward(
+        image.dtype == torch.float64, FASTEST_VARIANT, byref(_colors(image, recorded, white, scale)),
+        *native.pointers(truth, v_value, v_image),
+    )  # fmt: skip
+    return v_image
+
+
+def _colors(image: Tensor, recorded: Tensor, white: int, scale: float) -> native.CColors:
+    return native.CColors(*native.pointers(image, recorded), image.numel(), white, scale, native.thread_count())

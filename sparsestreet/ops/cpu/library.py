@@ -14,7 +14,7 @@ from torch import Tensor
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, to measure and test it."""
-_INTERFACE_VERSION = 17
+_INTERFACE_VERSION = 18
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -105,8 +105,40 @@ class CAdamRows(ctypes.Structure):
         *((name, c_int64) for name in ("rows", "width")),
         *((name, c_void_p) for name in ("parameter", "gradient", "exp_avg", "exp_avg_sq")),
         *((name, c_double) for name in ("share", "beta", "square_share", "root", "eps", "size")),
-        ("threads", c_int64),
         ("refused", c_void_p),
+    )
+
+
+class CScreenView(ctypes.Structure):
+    """What a view shows of each row, and the size of its image."""
+
+    _fields_ = (
+        ("rows", c_int64),
+        *((name, c_void_p) for name in ("gradient", "radii")),
+        *((name, c_double) for name in ("half_width", "half_height", "longer")),
+        *((name, c_int64) for name in ("visits_all", "threads")),
+    )
+
+
+class CPixelTerm(ctypes.Structure):
+    """A loss that is a mean over pixels."""
+
+    _fields_ = (
+        *((name, c_int64) for name in ("kind", "pixels")),
+        ("numbers", c_double * 3),
+        ("weight", c_double),
+        ("threads", c_int64),
+    )
+
+
+class CColors(ctypes.Structure):
+    """An image and a recorded one of 8 bits, and what their errors are multiplied by."""
+
+    _fields_ = (
+        *((name, c_void_p) for name in ("image", "recorded")),
+        *((name, c_int64) for name in ("numbers", "white")),
+        ("scale", c_double),
+        ("threads", c_int64),
     )
 
 
@@ -220,7 +252,11 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_activate_backward": (c_int32, (c_int32, c_int32, c_void_p, c_void_p, c_void_p)),
         "splat_poses": (None, (c_int32, c_int32, c_void_p, c_void_p)),
         "splat_poses_backward": (None, (c_int32, c_int32, c_int64, *(c_void_p,) * 5)),
-        "splat_adam": (None, (c_int32, c_int32, c_void_p)),
+        "splat_adam": (None, (c_int32, c_int32, c_void_p, c_int64, c_int64)),
+        "splat_statistics": (None, (c_int32, c_int32, c_void_p, c_void_p)),
+        "splat_pixel_mean": (c_int32, (c_int32, c_int32, *(c_void_p,) * 6)),
+        "splat_colors": (c_int32, (c_int32, c_int32, *(c_void_p,) * 4)),
+        "splat_colors_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
         "splat_ssim": (c_int32, (c_int32, c_int32, *(c_void_p,) * 3)),
         "splat_ssim_backward": (None, (c_int32, c_int32, *(c_void_p,) * 4)),
     }

@@ -9,8 +9,8 @@
 ``view`` holds the camera and the layout of records. ``screen`` runs the first two stages, ``pixels`` the third and the
 first half of the fourth. ``rasterizer`` makes an autograd function of them. ``quaternions`` serve all formulas.
 
-Other parts of a training step have a file each: ``poses`` and ``activate`` before the op, ``sky`` and ``ssim`` after
-it, and ``adam``.
+Other parts of a training step have a file each: ``poses`` and ``activate`` before the op, ``sky``, ``ssim``,
+``photometric`` and ``pixel_losses`` after it, then ``statistics`` and ``adam``.
 
 There are no atomics, so two runs agree to the last bit, except for the texels of the sky (``sky``). Nothing here is
 imported before backend "triton" is used.

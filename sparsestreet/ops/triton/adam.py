@@ -1,20 +1,20 @@
 """Adam for the rows that were seen, one lane per number; for other rows only the mask is read. And Adam for the rows
-whose gradient is finite, which a program reads whole."""
+whose gradient is finite, of all parameters in one launch."""
 
+from collections.abc import Sequence
 from functools import partial
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor, uint8
 from torch.autograd.graph import increment_version
 
-from sparsestreet.ops.triton.launch import jit, launch
+from sparsestreet.ops.triton.launch import constant, jit, launch
 
 # One number per lane: whether a lane loads differs between neighbors, so that wider loads would not be merged.
 LANES = 256
 OPTIONS = {"num_warps": 8}
-TABLE = 512
-"""Numbers of whole rows, padded to a power of two, that a program steps."""
 
 
 def step_rows_(
@@ -70,47 +70,155 @@ def step_numbers(
     tl.store(exp_avg_sq + at, v, seen)
 
 
-def step_finite_rows_(
-    parameter: Tensor,
-    gradient: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    refused: Tensor,
-    width: int,
-    step: tuple[float, ...],
-) -> None:
-    """``adam.adam_rows_`` on contiguous float32 tensors; ``step``: the numbers of its AdamStep."""
-    rows, padded = parameter.numel() // width, triton.next_power_of_2(width)
-    launch(
-        step_finite_rows, rows, max(TABLE // padded, 1),
-        parameter, gradient, exp_avg, exp_avg_sq, refused, rows, *step,
-        WIDTH=width, PADDED=padded, options=OPTIONS,
-    )  # fmt: skip
-    increment_version((parameter, exp_avg, exp_avg_sq))
+WIDE = 4
+"""Numbers of the 16 bytes that a lane reads at once: a program begins at a multiple of them."""
+FIELDS = 7
+"""Of a parameter: addresses of itself, its gradient and moments; its numbers, those of a row, its first program."""
+RATES = 6
+"""Numbers of an AdamStep."""
+PROGRAM = 1024
+"""Most numbers that a program steps; so that rows of up to 256 numbers begin at multiples of 16 bytes."""
+MIN_PLACES = 32
+_FIELDS, _RATES, _WIDE = constant(FIELDS), constant(RATES), constant(WIDE)
 
 
-@partial(jit, do_not_specialize=["rows"])
-def step_finite_rows(
-    parameter, gradient, exp_avg, exp_avg_sq, refused, rows,
-    share, beta, square_share, root, eps, size,
-    WIDTH: tl.constexpr, PADDED: tl.constexpr, BLOCK: tl.constexpr,
-):  # fmt: skip
-    """BLOCK rows of WIDTH numbers; ``refused``: how many were not finite, and the first of them."""
-    row = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    column = tl.arange(0, PADDED)
-    at = row[:, None] * WIDTH + column[None, :]
-    given = (row < rows)[:, None] & (column < WIDTH)[None, :]
-    g = tl.load(gradient + at, given, 0.0)
-    # NaN compares as false.
-    wrong = tl.max(tl.where(tl.abs(g) < float("inf"), 0, 1), 1)
-    seen = given & (wrong == 0)[:, None]
-    m, v = tl.load(exp_avg + at, seen, 0.0), tl.load(exp_avg_sq + at, seen, 0.0)
-    g = tl.where(seen, g, 0.0)
-    m, v, change = stepped(g, m, v, share, beta, square_share, root, eps, size)
-    tl.store(parameter + at, tl.load(parameter + at, seen, 0.0) - change, seen)
-    tl.store(exp_avg + at, m, seen)
-    tl.store(exp_avg_sq + at, v, seen)
-    count = tl.sum(wrong, 0)
-    if count > 0:
-        tl.atomic_add(refused, count.to(tl.int64))
-        tl.atomic_min(refused + 1, tl.min(tl.where(wrong > 0, row, 9223372036854775807), 0))
+class AdamTables:
+    """Parameters, their gradients and moments as the tables that one launch reads.
+
+    ``fill`` and ``launch`` step them. No argument of the launch depends on the step: recorded once with its copy, it is
+    played back after another ``fill``, of the same memory of the host; the copy before must have ended by then.
+
+    ``host`` is that memory, pinned where it is a GPU's, and ``launch`` copies it first.
+
+    Args:
+        parameters: contiguous float32 tensors of one device, as their gradients and moments are. Addresses are kept:
+            who launches again keeps the tensors.
+        gradients: one a parameter.
+        first: first moments.
+        second: second moments.
+        refused: int64 [parameters, 2], as in ``adam.adam_all_``.
+        widths: numbers of a row of each parameter, 256 at most.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[Tensor],
+        gradients: Sequence[Tensor],
+        first: Sequence[Tensor],
+        second: Sequence[Tensor],
+        refused: Tensor,
+        widths: Sequence[int],
+    ) -> None:
+        self._refused, self._programs, fields = refused, 0, []
+        for *tensors, width in zip(parameters, gradients, first, second, widths, strict=True):
+            numbers = tensors[0].numel()
+            fields.append([*(one.data_ptr() for one in tensors), numbers, width, self._programs])
+            self._programs += -(-numbers // numbers_of_program(width))
+        # Places that are left over begin behind the last program.
+        self._places = triton.next_power_of_2(max(len(fields), MIN_PLACES))
+        fields += [[0] * (FIELDS - 1) + [self._programs]] * (self._places - len(fields))
+        self._aligned = not any(address % (4 * WIDE) for field in fields for address in field[:4])
+        # One copy: an int64 holds two numbers of a step.
+        on_gpu = refused.is_cuda
+        self.host = torch.empty(FIELDS + RATES // 2, self._places, dtype=torch.int64, pin_memory=on_gpu)
+        self.host[:FIELDS] = torch.tensor(fields, dtype=torch.int64).T
+        self._rates = self.host[FIELDS:].view(torch.float32).view(RATES, self._places)
+        self._table = torch.empty_like(self.host, device=refused.device)
+
+    def fill(self, steps: Sequence[Sequence[float]]) -> None:
+        """Write the numbers of each parameter's AdamStep; on the host alone."""
+        self._rates[:, : len(steps)] = torch.tensor(steps).T
+
+    def launch(self) -> None:
+        """Copy the tables to the device and step all parameters."""
+        self._table.copy_(self.host, non_blocking=True)
+        launch(
+            step_tables, self._programs * PROGRAM, PROGRAM,
+            self._table, self._table.view(torch.float32), self._refused,
+            PLACES=self._places, ALIGNED=self._aligned, options=OPTIONS,
+        )  # fmt: skip
+
+
+def numbers_of_program(width: int) -> int:
+    """Return how many numbers a program steps: whole rows, and a multiple of WIDE."""
+    return PROGRAM // (WIDE * width) * (WIDE * width)
+
+
+@jit
+def place_of(table, rates, PLACES: tl.constexpr, BLOCK: tl.constexpr):
+    """Return where a program's parameter stands in the table, the numbers of its step, which parameter it is, the first
+    number of the program, how many there are, and how many make a row."""
+    program = tl.program_id(0)
+    begins = tl.load(table + (_FIELDS - 1) * PLACES + tl.arange(0, PLACES))
+    place = tl.sum((begins <= program).to(tl.int32), 0) - 1
+    field = table + place
+    width = tl.load(field + (_FIELDS - 2) * PLACES).to(tl.int32)
+    # That all are multiples of four is seen by the compiler.
+    size = BLOCK // (_WIDE * width) * width * _WIDE
+    start = (program - tl.load(field + (_FIELDS - 1) * PLACES)) * size
+    left = tl.minimum(tl.load(field + (_FIELDS - 3) * PLACES) - start, size).to(tl.int32)
+    numbers = ()
+    for i in tl.static_range(_RATES):
+        numbers += (tl.load(rates + (2 * _FIELDS + i) * PLACES + place),)
+    return field, numbers, place, start, left, width
+
+
+@jit
+def pointer(address, start, ALIGNED: tl.constexpr):
+    """Return a pointer to a tensor's number ``start``."""
+    first = tl.load(address).to(tl.pointer_type(tl.float32))
+    if ALIGNED:
+        first = tl.multiple_of(first, 16)
+    return first + start
+
+
+@jit
+def not_finite(g):
+    """1 where a number is NaN, which compares as false, or infinite."""
+    return tl.where(tl.abs(g) < float("inf"), 0, 1)
+
+
+@jit
+def step_given(p, m, v, g, values, first, second, given, rates):
+    first, second, change = stepped(g, first, second, rates[0], rates[1], rates[2], rates[3], rates[4], rates[5])
+    tl.store(p, values - change, given)
+    tl.store(m, first, given)
+    tl.store(v, second, given)
+
+
+@jit
+def step_tables(table, rates, refused, PLACES: tl.constexpr, ALIGNED: tl.constexpr, BLOCK: tl.constexpr):
+    """Whole rows of one parameter. ``table`` int64 [FIELDS, PLACES], and behind it ``rates`` float32 [RATES, PLACES],
+    of the same memory; ``refused`` int64 [PLACES, 2]: how many rows were not finite, and the first of them."""
+    field, rates, place, start, left, width = place_of(table, rates, PLACES, BLOCK)
+    lane = tl.arange(0, BLOCK)
+    p = pointer(field, start, ALIGNED) + lane
+    g = pointer(field + PLACES, start, ALIGNED) + lane
+    m = pointer(field + 2 * PLACES, start, ALIGNED) + lane
+    v = pointer(field + 3 * PLACES, start, ALIGNED) + lane
+    wrong = 1
+    if left % _WIDE == 0:
+        given = lane < left // _WIDE * _WIDE
+        # Nearly always all rows step: all is read at once, before the gradient is looked at.
+        gradient, values = tl.load(g, given, 0.0), tl.load(p, given, 0.0)
+        first, second = tl.load(m, given, 0.0), tl.load(v, given, 0.0)
+        wrong = tl.max(not_finite(gradient), 0)
+        if wrong == 0:
+            step_given(p, m, v, gradient, values, first, second, given, rates)
+    # A parameter's last numbers, and rows of which some rest.
+    if wrong > 0:
+        row = lane // width
+        given = lane < left
+        bad = tl.zeros_like(lane)
+        for column in range(width):
+            # From the cache.
+            bad |= not_finite(tl.load(g - lane + row * width + column, given, 0.0))
+        seen = given & (bad == 0)
+        gradient, values = tl.load(g, seen, 0.0), tl.load(p, seen, 0.0)
+        first, second = tl.load(m, seen, 0.0), tl.load(v, seen, 0.0)
+        step_given(p, m, v, gradient, values, first, second, seen, rates)
+        count = tl.sum(tl.where(row * width == lane, bad, 0), 0)
+        if count > 0:
+            tl.atomic_add(refused + 2 * place, count.to(tl.int64))
+            number = tl.where(bad > 0, start // width + row, 9223372036854775807)
+            tl.atomic_min(refused + 2 * place + 1, tl.min(number, 0))

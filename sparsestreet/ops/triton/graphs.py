@@ -11,7 +11,7 @@ that does not fit is drawn again without a graph, and the next one is captured w
 
 import threading
 import weakref
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple, TypeVar
@@ -35,19 +35,8 @@ MAX_KEPT = 8
 """Kinds of views that are kept. Each holds what a rendering and its backward pass need, in memory of its own."""
 
 
-@dataclass
-class Counts:
-    """What has happened in this process."""
-
-    captured: int = 0
-    """Passes."""
-    replayed: int = 0
-    """Renderings."""
-    again: int = 0
-    """Renderings whose lists did not fit their room, which were done again."""
-
-
-COUNTS = Counts()
+COUNTS: Counter[str] = Counter()
+"""Of this process: passes that were "captured", renderings "replayed", and those done "again" for lack of room."""
 
 
 class Images(NamedTuple):
@@ -171,7 +160,7 @@ class ViewGraph:
 
     def captured(self, run: Callable[[], Answer]) -> tuple[Callable[[], None], Answer]:
         """Capture what ``run`` starts, in the view's own memory."""
-        COUNTS.captured += 1
+        COUNTS["captured"] += 1
         return self._memory.captured(run)
 
     def draw(self, inputs: Inputs) -> "tuple[Lease, Images] | None":
@@ -185,11 +174,11 @@ class ViewGraph:
         sizes = Sizes(self._sizes)
         read(sizes, counted, inputs.gaussians, self._projection)
         if not self._room.holds(sizes.pairs, sizes.rows):
-            COUNTS.again += 1
+            COUNTS["again"] += 1
             return None
         rows = len(inputs.fields[0])
         remember(like(rows, inputs.view, self._sizes.device), sizes.rows, sizes.pairs)
-        COUNTS.replayed += 1
+        COUNTS["replayed"] += 1
         lease = Lease(self)
         self._lease = weakref.ref(lease)
         return lease, images

@@ -31,14 +31,41 @@ TWICE_C1, TWICE_C2 = constant(2 * C1), constant(2 * C2)
 
 
 def mean_ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """``sparsestreet.ops.ssim.ssim`` of contiguous float32 images; raises ValueError above 239 million pixels."""
+    """``sparsestreet.ops.ssim.ssim`` of contiguous float32 images; raises as ``similarity_sums`` does."""
+    return _MeanSSIM.apply(image, truth)
+
+
+def similarity_sums(image: Tensor, truth: Tensor, keep: bool) -> tuple[Tensor, Tensor]:
+    """Return each program's sum of similarities, and if ``keep`` the three derivatives [3, h-10, 3 (w-10)].
+
+    Raises ValueError above 239 million pixels."""
     height, width, _ = image.shape
     if 9 * (height - WINDOW + 1) * (width - WINDOW + 1) > MAX_NUMBERS:
         raise ValueError(
             f"SSIM by backend 'triton' takes images of up to {MAX_NUMBERS // 9 / 1e6:.0f} million pixels, got "
             f"{width}x{height}: use smaller images or backend='torch'"
         )
-    return _MeanSSIM.apply(image, truth)
+    height, width = height - WINDOW + 1, 3 * (width - WINDOW + 1)
+    strips, lanes = _programs(height, width)
+    sums = image.new_empty(strips * (lanes // LANES))
+    partials = image.new_empty(3 if keep else 0, height, width)
+    launch(
+        similarity, strips * lanes, LANES,
+        image, truth, partials, sums, height, width, LINES=LINES, PARTIALS=keep,
+    )  # fmt: skip
+    return sums, partials
+
+
+def similarity_gradient(image: Tensor, truth: Tensor, partials: Tensor, v_mean: Tensor) -> Tensor:
+    """Return the gradient of the image from that of the mean."""
+    _, height, width = partials.shape
+    strips, lanes = _programs(image.shape[0], 3 * image.shape[1])
+    v_image = torch.empty_like(image)
+    launch(
+        similarity_backward, strips * lanes, LANES,
+        image, truth, partials, v_mean, v_image, height, width, 1 / (height * width), LINES=LINES,
+    )  # fmt: skip
+    return v_image
 
 
 class _MeanSSIM(torch.autograd.Function):
@@ -46,29 +73,14 @@ class _MeanSSIM(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, image, truth):
-        height, width = image.shape[0] - WINDOW + 1, 3 * (image.shape[1] - WINDOW + 1)
-        strips, lanes = _programs(height, width)
-        sums = image.new_empty(strips * (lanes // LANES))
-        partials = image.new_empty(3 if ctx.needs_input_grad[0] else 0, height, width)
-        launch(
-            similarity, strips * lanes, LANES,
-            image, truth, partials, sums, height, width, LINES=LINES, PARTIALS=ctx.needs_input_grad[0],
-        )  # fmt: skip
+        sums, partials = similarity_sums(image, truth, ctx.needs_input_grad[0])
         ctx.save_for_backward(image, truth, partials)
-        return sums.sum() / (height * width)
+        return sums.sum() / partials.shape[1:].numel()
 
     @staticmethod
     @once_differentiable
     def backward(ctx, v_mean):
-        image, truth, partials = ctx.saved_tensors
-        _, height, width = partials.shape
-        strips, lanes = _programs(image.shape[0], 3 * image.shape[1])
-        v_image = torch.empty_like(image)
-        launch(
-            similarity_backward, strips * lanes, LANES,
-            image, truth, partials, v_mean, v_image, height, width, 1 / (height * width), LINES=LINES,
-        )  # fmt: skip
-        return v_image, None
+        return similarity_gradient(*ctx.saved_tensors, v_mean), None
 
 
 def _programs(height: int, width: int) -> tuple[int, int]:

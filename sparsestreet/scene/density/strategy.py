@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sparsestreet.ops.statistics import add_view_
 from sparsestreet.ranks import Ranks
 from sparsestreet.scene.gaussians import RowPlan, Rows
 
@@ -49,7 +50,6 @@ class DensityStatistics:
     def __len__(self) -> int:
         return self.visits.shape[0]
 
-    @torch.no_grad()
     def add(
         self,
         screen_gradient: Float[Tensor, "n 2"],
@@ -59,7 +59,7 @@ class DensityStatistics:
         gradients: Mapping[str, Float[Tensor, " n"]] | None = None,
     ) -> None:
         """Add one view after its backward pass; rows with radius 0 were not drawn and do not change,
-        nor do those whose gradient is not finite.
+        nor do those whose gradient is not finite: they do not step, and have no say here.
 
         ``screen_gradient`` is the absolute gradient of the loss per pixel of the projected mean
         (``Rendering.screen_offsets.grad``), ``radii`` are pixels, both for this node's rows. As in 3DGS and DriveStudio
@@ -71,16 +71,12 @@ class DensityStatistics:
                 f"the view has {radii.shape[0]} rows but the statistics have {len(self)}: apply every RowPlan of the "
                 "node to its statistics as well"
             )
-        drawn = radii > 0
-        norm = torch.hypot(screen_gradient[:, 0] * (width / 2), screen_gradient[:, 1] * (height / 2))
-        drawn &= norm < torch.inf  # a row with a gradient that is not finite does not step, and has no say here
-        self.gradient_sum += torch.where(drawn, norm, 0.0)
-        self.visits += 1 if self.is_empty and self.first_counts_all else drawn
+        add_view_(
+            self.gradient_sum, self.visits, self.largest_screen, screen_gradient, radii, (width, height),
+            visits_all=self.is_empty and self.first_counts_all,
+            watched=[(total, (gradients or {})[name]) for name, total in self.watched.items()],
+        )  # fmt: skip
         self.is_empty = False
-        self.largest_screen = torch.maximum(self.largest_screen, radii / max(width, height))
-        for name, total in self.watched.items():
-            absolute = (gradients or {})[name].abs()
-            total += torch.where(drawn & (absolute < torch.inf), absolute, 0.0)
 
     def mean_gradients(self, column: str | None = None) -> Float[Tensor, " n"]:
         """Return the mean norm on screen over the visits, or the mean absolute gradient of a watched column.

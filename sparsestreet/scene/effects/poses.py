@@ -145,7 +145,7 @@ _SHARED = 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPosesSettings(EffectSettings):
-    """Threshold, regularizer and rates. Raises ValueError for a negative weight or threshold."""
+    """Threshold, regularizer and rates. Raises ValueError for a negative weight or threshold, or a unit not above 0."""
 
     threshold: float = 0.5
     """Pixels that poses move the median image by, from one image to the next (``evidence.poses``)."""
@@ -156,12 +156,16 @@ class CameraPosesSettings(EffectSettings):
         default_factory=lambda: {"translations": LearningRate(0.15, 0.0015), "rotations": LearningRate(0.15, 0.0015)}
     )
     """In units of the measured error: where poses are right, hardly anything is learned."""
+    unit: float | None = None
+    """Radians, and as far at 10 m, that such a unit is instead, whatever is measured; corrections start at zero."""
     probed: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (self.weight >= 0 and self.threshold >= 0):
             raise ValueError(f"weight and threshold must be >= 0, got {self.weight} and {self.threshold}")
+        if self.unit is not None and not self.unit > 0:
+            raise ValueError(f"unit must be above 0 radians, got {self.unit}: null for the measured error")
 
     def detect(self, data: TrainingData) -> Finding:
         """Measure images of a few stretches of the drive (``evidence.poses``)."""
@@ -191,6 +195,8 @@ class CameraPosesSettings(EffectSettings):
         views = data.views
         poses = torch.stack([view.camera.camera_from_world for view in views])
         recorded = RecordedPoses([view.indices for view in views], [view.time for view in views], poses)
+        if self.unit is not None:
+            return CameraPoses(self, recorded, torch.zeros(len(views), 6), torch.full((len(views),), self.unit))
         said = self.threshold, finding.value
         start, noise = data.log.kept.get("poses", said, lambda: self._start(data, finding, recorded))
         focal = torch.stack([view.camera.intrinsics[0, 0] for view in views])

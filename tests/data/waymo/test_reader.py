@@ -1,5 +1,8 @@
 """What is read of a drive in either version equals the plan that it was written from."""
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -115,6 +118,43 @@ def test_points_lie_where_images_of_a_rolling_shutter_show_them(tmp_path):
     assert seen > 15
     assert max(errors) < 0.5
     assert max(still) > 5
+
+
+def test_the_options_that_a_preset_of_drivestudio_has(root, drive, tmp_path):
+    """Lenses leave images and masks, as they leave those of a folder in its layout; far returns are cut; the box of the
+    scene lies along the first pose of the vehicle."""
+    mask = tmp_path / "human/FRONT"
+    mask.mkdir(parents=True)
+    lines = np.zeros((24, 32), np.uint8)
+    lines[:, ::3] = 255
+    for frame in range(4):
+        cv2.imwrite(str(mask / f"{frame:03d}.png"), lines)
+    reader = WaymoReader(root=root, masks=tmp_path, cameras=["FRONT"])
+    plain, options = reader.read(), replace(reader, undistort=True, lidar_ahead=(-2, 20), extent="first_pose").read()
+    assert plain.views[0].camera.distortion is not None
+    assert options.views[0].camera.distortion is plain.first_axes is None
+    camera = drive.cameras[0]
+    k = camera.intrinsics
+    shifted = k - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV counts from the first pixel's center
+    for one, other in zip(plain.frames, options.frames, strict=True):
+        expected = cv2.undistort(one.image.numpy(), shifted, np.array(LENS))
+        # Both interpolate with weights of 1/32 of a pixel.
+        assert np.abs(other.image.numpy().astype(int) - expected.astype(int)).max() <= 2
+    own = replace(reader, masks=None)  # of which one image has some, drawn by hand
+    given, labels = (
+        (plain.frames[1], options.frames[1]),
+        (own.read().frames[1], replace(own, undistort=True).read().frames[1]),
+    )
+    (front,) = replace(reader, undistort=True).recording().rig
+    take_out = there(front.undistortion)  # the images above say that it is right
+    for one, other in (given, labels):
+        recorded, found = there(one.human).numpy(), there(other.human).numpy()
+        seen = take_out(255 * recorded.astype(np.uint8)) > 0
+        assert np.array_equal(found, seen)
+        assert not np.array_equal(found, recorded)
+    assert 0 < len(options.sweeps[1].points) < len(plain.sweeps[1].points)
+    pose = drive.frame_pose(0)
+    np.testing.assert_allclose(there(options.first_axes).numpy(), pose[:3, :3], atol=1e-6)
 
 
 @pytest.mark.parametrize("direction", [1, 2, 3, 4])

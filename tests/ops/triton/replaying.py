@@ -5,6 +5,7 @@ As on a device, a replay runs no Python of ours: numbers that the host has put i
 
 import importlib
 import pkgutil
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -132,4 +133,4 @@ def record_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
             monkeypatch.setattr(module, "launch", launched)
     monkeypatch.setattr(graphs, "Memory", RecordedMemory)
     monkeypatch.setattr(graphs, "_kept", type(graphs._kept)())
-    monkeypatch.setattr(graphs, "COUNTS", graphs.Counts())
+    monkeypatch.setattr(graphs, "COUNTS", Counter())

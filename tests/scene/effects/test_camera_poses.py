@@ -15,6 +15,7 @@ from sparsestreet.ops import SplatSettings, splat
 from sparsestreet.scene.effects import Finding
 from sparsestreet.scene.effects import poses as camera_poses
 from sparsestreet.scene.effects.poses import CameraPoses, CameraPosesSettings, RecordedPoses
+from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.types import Camera, Frame, Gaussians, Shutter, View
 from tests.scene.street import camera_at, random_rows, training_data
@@ -318,3 +319,20 @@ def test_forced_on_without_a_measurement_errors_are_as_large_as_the_threshold():
     made = SETTINGS.build(data, Finding(called_for=False, reason=""), torch.Generator())
     assert not made.corrections().any()
     assert made.expected[0] == pytest.approx(0.5 / float(data.views[0].camera.intrinsics[0, 0]))
+
+
+def test_rates_are_fixed_in_a_unit_that_is_given(monkeypatch: pytest.MonkeyPatch):
+    """Adam's first step is a rate long: 1e-5 rad and 10 x 1e-6 m, whatever was measured, in every pose alike."""
+    monkeypatch.setattr(camera_poses, "pose_noise", lambda *_: pytest.fail("nothing is to be measured again"))
+    rates = {"translations": LearningRate(1e-6), "rotations": LearningRate(1e-5)}
+    settings = replace(SETTINGS, weight=0.0, unit=1.0, learning_rates=rates)
+    made = settings.build(training_data(), Finding(called_for=True, reason="", value=3.0), torch.Generator())
+    assert not made.corrections().any()
+    groups = [{"params": [getattr(made, name)], "lr": rate.initial} for name, rate in rates.items()]
+    optimizer = torch.optim.Adam(groups, eps=1e-15)
+    made.translations.grad, made.rotations.grad = torch.full((5, 3), 7.0), torch.full((5, 3), -0.2)
+    optimizer.step()
+    expected = torch.tensor([-1e-5] * 3 + [1e-5] * 3, dtype=torch.float64).expand(5, 6)
+    torch.testing.assert_close(made.corrections(), expected, rtol=1e-6, atol=0)  # float32
+    with pytest.raises(ValueError, match="unit must be above 0 radians"):
+        replace(SETTINGS, unit=0.0)

@@ -150,8 +150,8 @@ def test_triton_gets_the_samples(monkeypatch):
     kernels = pytest.importorskip("sparsestreet.ops.triton.rasterizer")
     given = []
 
-    def drawn(gaussians, offsets, background, camera, settings, gates, changes):
-        assert changes is None
+    def drawn(gaussians, offsets, background, camera, settings, gates, changes, replay):
+        assert (changes, replay) == (None, False)
         given.append(gates)
         return splat(gaussians, camera, background=background, settings=settings, backend="reference", gates=gates)
 

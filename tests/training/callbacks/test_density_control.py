@@ -254,12 +254,12 @@ def test_noise_is_added_after_every_step_and_follows_from_the_step():
 def drivestudio(every: int = 30) -> DensityControl:
     """Resets at 32, 62 and 92, if every 30 steps; refines at 5, 10 ... 100 of 100 steps."""
     return DensityControl(
-        Interval(0.0, 1.0, every=5), 1.0, Interval(0.0, 1.0, every=every, shift=2), pause_after_reset=None
+        Interval(0.05, 1.0, every=5), 1.0, Interval(0.05, 1.0, every=every, shift=2), pause_after_reset=None
     )
 
 
 def test_after_a_reset_every_training_image_comes_first():
-    """DriveStudio's gate: 12 images close the first 12 steps of each 30; nothing is reset at step 2."""
+    """DriveStudio's gate: 12 images close the first 12 steps of each 30; none is reset at step 2, before it begins."""
     strategy, listener = AskedStrategy(), Listener()
     system = make_system({"background": background(4, density=strategy)})
     trainer = StubTrainer(system, [control := drivestudio(), listener], train=tuple(map(frame_at, range(12))))

@@ -1,8 +1,6 @@
 // One step of Adam for the rows whose gradient is finite (Kingma & Ba 2015, algorithm 1). A gradient is read once: a
 // block of it is looked at, and is still in the cache when its rows step.
 #pragma once
-#include <omp.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstdint>
@@ -59,27 +57,37 @@ inline void step_numbers(const splat::AdamRows& a, int64_t begin, int64_t end) {
   for (int64_t i = split; i < end; ++i) finish(i, fused(v[i], beta, square_share * g[i] * g[i]));
 }
 
+inline int64_t rows_of_block(int64_t width) { return std::max<int64_t>(1, BLOCK_NUMBERS / width); }
+
+// One block of a table: where a number in it is not finite, row by row.
 template <class T>
-void adam(const splat::AdamRows& a) {
+void step_block(const splat::AdamRows& a, int64_t row) {
   const T* g = static_cast<const T*>(a.gradient);
-  const int64_t width = a.width, together = std::max<int64_t>(1, BLOCK_NUMBERS / width);
+  const int64_t width = a.width, last = std::min(row + rows_of_block(width), a.rows);
+  if (finite(g + row * width, (last - row) * width)) {
+    step_numbers<T>(a, row * width, last * width);
+    return;
+  }
   int64_t refused = 0, first = std::numeric_limits<int64_t>::max();
-#pragma omp parallel for num_threads(a.threads) schedule(static) reduction(+ : refused) reduction(min : first)
-  for (int64_t row = 0; row < a.rows; row += together) {
-    const int64_t last = std::min(row + together, a.rows);
-    if (finite(g + row * width, (last - row) * width)) {
-      step_numbers<T>(a, row * width, last * width);
-      continue;
-    }
-    for (int64_t one = row; one < last; ++one) {
-      if (finite(g + one * width, width)) {
-        step_numbers<T>(a, one * width, (one + 1) * width);
-      } else {
-        ++refused, first = std::min(first, one);
-      }
+  for (int64_t one = row; one < last; ++one) {
+    if (finite(g + one * width, width)) {
+      step_numbers<T>(a, one * width, (one + 1) * width);
+    } else {
+      ++refused, first = std::min(first, one);
     }
   }
-  if (refused > 0) a.refused[0] += refused, a.refused[1] = std::min(a.refused[1], first);
+#pragma omp critical(splat_adam_refused)
+  a.refused[0] += refused, a.refused[1] = std::min(a.refused[1], first);
+}
+
+// All tables in one go: threads meet once a step, and who is done with a table goes on with the next.
+template <class T>
+void adam(const splat::AdamRows* tables, int64_t count, int64_t threads) {
+#pragma omp parallel num_threads(threads)
+  for (int64_t i = 0; i < count; ++i) {
+#pragma omp for schedule(static) nowait
+    for (int64_t row = 0; row < tables[i].rows; row += rows_of_block(tables[i].width)) step_block<T>(tables[i], row);
+  }
 }
 
 }  // namespace SPLAT_VARIANT

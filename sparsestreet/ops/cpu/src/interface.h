@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 17;
+constexpr int32_t INTERFACE_VERSION = 18;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -154,8 +154,43 @@ struct AdamRows {
   const void* gradient;
   void *exp_avg, *exp_avg_sq;
   double share, beta, square_share, root, eps, size;
-  int64_t threads;
   int64_t* refused;  // number of rows whose gradient is not finite, and the first of them
+};
+
+// What a view shows of each row: [rows, 2] gradients per pixel, and radii; half the sides of the image, and the longer.
+struct ScreenView {
+  int64_t rows;
+  const void *gradient, *radii;
+  double half_width, half_height, longer;
+  int64_t visits_all, threads;
+};
+
+// Sums over views that take it in. Null: the three that all nodes have, or the watched column.
+struct RowStatistics {
+  void* gradient_sum;
+  int64_t* visits;
+  void *largest_screen, *watched_sum;
+  const void* watched;
+};
+
+// Kinds of losses that are a mean over pixels, and their numbers: of depths the nearest and farthest return and the
+// nearest rendered depth, of a sky epsilon and the floor.
+enum PixelKind { DEPTH, INVERSE_DEPTH, SKY };
+
+struct PixelTerm {
+  int64_t kind, pixels;
+  double numbers[3], weight;
+  int64_t threads;
+};
+
+// An image and a recorded one of 8 bits; from level `white` on a larger number counts as equal. Errors are summed times
+// `scale`.
+struct Colors {
+  const void* image;
+  const uint8_t* recorded;
+  int64_t numbers, white;
+  double scale;
+  int64_t threads;
 };
 
 enum Stage { PROJECT, BIN, BLEND, BLEND_BACKWARD, PROJECT_BACKWARD, COUNT, STAGES };

@@ -31,6 +31,12 @@ struct SkyKernels {
   void (*backward)(const Sky&, const void* alpha, const void* v_out, void* v_alpha, void* v_texels);
 };
 
+struct LossKernels {
+  void (*mean)(const PixelTerm&, const void* predicted, const void* truth, void* slopes, void* mean, void* share);
+  void (*colors)(const Colors&, void* seen, void* truth, void* error);
+  void (*colors_backward)(const Colors&, const void* truth, const void* v_value, void* v_image);
+};
+
 struct NodeKernels {
   void (*activate)(const RawRows&, const ActiveRows&);
   void (*activate_backward)(const RawRows&, const ActiveRows& cotangents, const RawGradients&);
@@ -40,7 +46,11 @@ struct NodeKernels {
 };
 
 struct AdamKernels {
-  void (*step)(const AdamRows&);
+  void (*step)(const AdamRows* tables, int64_t count, int64_t threads);
+};
+
+struct StatisticsKernels {
+  void (*add)(const ScreenView&, const RowStatistics&);
 };
 
 struct SimilarityKernels {
@@ -53,8 +63,10 @@ struct Kernels {
   RowKernels rows[2];      // float, double
   PixelKernels pixels[2];
   SkyKernels sky[2];
+  LossKernels losses[2];
   NodeKernels nodes[2];
   AdamKernels adam[2];
+  StatisticsKernels statistics[2];
   SimilarityKernels similarity[2];
 };
 

@@ -208,8 +208,32 @@ SPLAT_API void splat_poses_backward(int32_t is_double, int32_t index, int64_t in
                                                 translation_deltas);
 }
 
-SPLAT_API void splat_adam(int32_t is_double, int32_t index, const AdamRows* rows) {
-  chosen(index).adam[is_double].step(*rows);
+SPLAT_API void splat_adam(int32_t is_double, int32_t index, const AdamRows* tables, int64_t count, int64_t threads) {
+  chosen(index).adam[is_double].step(tables, count, threads);
+}
+
+SPLAT_API void splat_statistics(int32_t is_double, int32_t index, const ScreenView* view, const RowStatistics* into) {
+  chosen(index).statistics[is_double].add(*view, *into);
+}
+
+// A weighted mean over pixels, the share of each in it, and unless `slopes` is null the derivative of each.
+SPLAT_API int32_t splat_pixel_mean(int32_t is_double, int32_t index, const PixelTerm* term, const void* predicted,
+                                   const void* truth, void* slopes, void* mean, void* share) {
+  return guarded([&]() -> int32_t {
+    return chosen(index).losses[is_double].mean(*term, predicted, truth, slopes, mean, share), OK;
+  });
+}
+
+// What is compared of both images, and the sum of errors times `scale`.
+SPLAT_API int32_t splat_colors(int32_t is_double, int32_t index, const Colors* colors, void* seen, void* truth,
+                               void* error) {
+  return guarded([&]() -> int32_t { return chosen(index).losses[is_double].colors(*colors, seen, truth, error), OK; });
+}
+
+// Adds the gradient of the errors to `v_image`, and takes both from what does not count.
+SPLAT_API void splat_colors_backward(int32_t is_double, int32_t index, const Colors* colors, const void* truth,
+                                     const void* v_value, void* v_image) {
+  chosen(index).losses[is_double].colors_backward(*colors, truth, v_value, v_image);
 }
 
 // Mean similarity, and its partial derivatives unless `partials` is null.

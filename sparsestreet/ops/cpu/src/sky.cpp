@@ -1,7 +1,8 @@
-// Compiled once per instruction set, with strict IEEE rules.
+// What is behind an image, and losses of its pixels. Compiled once per instruction set, with strict IEEE rules.
 #include "sky.hpp"
 
 #include "kernels.h"
+#include "pixel_losses.hpp"
 
 namespace SPLAT_VARIANT {
 namespace {
@@ -19,6 +20,10 @@ SkyKernels kernels() {
 
 }  // namespace
 
-void fill_sky_kernels(Kernels& k) { k.sky[0] = kernels<float>(), k.sky[1] = kernels<double>(); }
+void fill_sky_kernels(Kernels& k) {
+  k.sky[0] = kernels<float>(), k.sky[1] = kernels<double>();
+  k.losses[0] = {pixel_mean<float>, compare_colors<float>, compare_colors_backward<float>};
+  k.losses[1] = {pixel_mean<double>, compare_colors<double>, compare_colors_backward<double>};
+}
 
 }  // namespace SPLAT_VARIANT
