@@ -41,7 +41,7 @@ def with_bodies(log: DrivingLog, held_out: frozenset[int], classes: Collection[s
     return replace(log, tracks=tuple(replace(track, body=bodies.get(track.name, track.body)) for track in log.tracks))
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Person:
     """A track without the frames that are held out, and its returns."""
 

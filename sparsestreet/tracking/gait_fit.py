@@ -1,6 +1,7 @@
 """The gait that the returns of a lidar show best."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -55,10 +56,11 @@ class Seen:
         if len(self.points) < MIN_RETURNS:
             return gait_of(np.zeros((1, _NUMBERS)))
         first, ends = self._tried(), []
+        slopes: Any = self._slopes  # of functions scipy's types know nothing
         # Seen from the side, a body half a stride later looks much the same.
         for later in (0.0, np.pi):
             start = first + later * np.eye(_NUMBERS)[0]
-            ends.append(least_squares(self._residuals, start, self._slopes, loss="soft_l1", max_nfev=30))
+            ends.append(least_squares(self._residuals, start, slopes, loss="soft_l1", max_nfev=30))
         return gait_of(min(ends, key=lambda end: end.cost).x[None])
 
     def _tried(self) -> Float64[np.ndarray, " p"]:
