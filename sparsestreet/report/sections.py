@@ -19,6 +19,7 @@ from sparsestreet.report.tables import (
     ABSENT,
     BUSY,
     CAPPED,
+    GEOMETRY,
     LEFT_OUT,
     Quantity,
     Spread,
@@ -249,6 +250,7 @@ def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> 
     counts = {"Gaussians": "Gaussians"} | {name: f"Gaussians of {name}" for name in nodes}
     known = (
         *(Quantity(heading, f"{HELD_OUT} {name}", text) for heading, name, text in metrics),
+        *GEOMETRY,
         *(Quantity(f"train-view {heading}", f"{TRAINING} {name}", text) for heading, name, text in of_training),
         *(Quantity(name, column, "{:,.0f}", relative=True, count=True) for name, column in counts.items()),
         *_TIMES,

@@ -138,19 +138,26 @@ class _Part:
 
 
 def _fan(rays: Rays) -> Iterator[_Part]:
-    """Yield the views that have rays: level ones from the azimuth of the first ray on, then those of steep rays."""
+    """Yield the views that have rays: level ones by azimuth, and those of steep rays."""
     x, y, z = (rays.directions.cpu().double() / rays.directions.cpu().double().norm(dim=-1, keepdim=True)).unbind(-1)
     azimuths, width = torch.atan2(y, x), 2 * math.pi / VIEWS
-    # A turn ends where it begins: a view across that place would show two times at once.
-    start = 0.0 if rays.seconds is None or not len(x) else float(azimuths[rays.seconds.argmin()])
-    sectors = (torch.remainder(azimuths - start, 2 * math.pi) / width).long().clamp(max=VIEWS - 1)
+    sectors = (torch.remainder(azimuths, 2 * math.pi) / width).long().clamp(max=VIEWS - 1)
     steep = z.abs() > math.sin(MAX_ELEVATION)
     sectors[steep] = torch.where(z[steep] > 0, VIEWS, VIEWS + 1)
-    for sector in sectors.unique().tolist():
+    late = _late(rays)
+    for sector, half in torch.stack((sectors, late.long()), -1).unique(dim=0).tolist():
         pitch = 0.0 if sector < VIEWS else math.pi / 2 if sector == VIEWS else -math.pi / 2
-        yaw = start + (sector + 0.5) * width if sector < VIEWS else 0.0
-        rows = torch.nonzero(sectors == sector).squeeze(-1)
+        yaw = (sector + 0.5) * width if sector < VIEWS else 0.0
+        rows = torch.nonzero((sectors == sector) & (late == half)).squeeze(-1)
         yield _part(rays, rows, torch.stack((x, y, z), -1)[rows], _camera_axes(yaw, pitch))
+
+
+def _late(rays: Rays) -> Bool[Tensor, " n"]:
+    """Return which rays are fired in the second half of a turn: it ends where it begins, and no view shows both."""
+    if rays.seconds is None or not len(rays.seconds):
+        return torch.zeros(len(rays.directions), dtype=torch.bool)
+    first, last = rays.seconds.aminmax()
+    return (rays.seconds > (first + last) / 2).cpu()
 
 
 def _camera_axes(yaw: float, pitch: float) -> Float64[Tensor, "3 3"]:
