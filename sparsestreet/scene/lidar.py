@@ -26,6 +26,9 @@ VIEWS = 8
 """Level views of 360 / 8 degrees. Twelve see nothing better."""
 MAX_ELEVATION = math.radians(50)
 """Of the rays of a level view, up or down; two more views hold steeper ones, if there are any."""
+_VIEW_ANGLES = [(2 * math.pi * (view + 0.5) / VIEWS, 0.0) for view in range(VIEWS)]
+_VIEW_ANGLES += [(0.0, math.pi / 2), (0.0, -math.pi / 2)]
+"""Yaw and pitch of the optical axes, radians: level ones, the zenith and the nadir."""
 PIXELS = 2
 """Along each axis from one ray to the next. The op blurs by about a pixel, so one would mix what two rays meet."""
 MIN_SPACING = 1e-4
@@ -116,10 +119,9 @@ def render_ranges(
     for part in _fan(rays):
         moment = 0.0 if duration is None else part.seconds / duration
         placed = scene.gaussians_at(View(part.camera, time + moment))
-        depth, coverage = _median_depth(placed.gaussians, placed.view.camera, options)
-        found, ranges_alpha = _at(depth, coverage, part.positions.to(depth))
-        ranges[part.rows] = (found / part.cosines.to(found)).to(like)
-        alpha[part.rows] = ranges_alpha.to(like)
+        depths, alphas = _at(*_median_depth(placed.gaussians, part.camera, options), part.positions.to(scene.device))
+        ranges[part.rows] = (depths / part.cosines.to(depths)).to(like)
+        alpha[part.rows] = alphas.to(like)
     return Ranges(ranges, alpha)
 
 
@@ -139,17 +141,16 @@ class _Part:
 
 def _fan(rays: Rays) -> Iterator[_Part]:
     """Yield the views that have rays: level ones by azimuth, and those of steep rays."""
-    x, y, z = (rays.directions.cpu().double() / rays.directions.cpu().double().norm(dim=-1, keepdim=True)).unbind(-1)
-    azimuths, width = torch.atan2(y, x), 2 * math.pi / VIEWS
-    sectors = (torch.remainder(azimuths, 2 * math.pi) / width).long().clamp(max=VIEWS - 1)
+    directions = rays.directions.cpu().double()
+    x, y, z = directions.unbind(-1)
+    turns = torch.remainder(torch.atan2(y, x) / (2 * math.pi), 1.0)
+    places = (VIEWS * turns).long().clamp(max=VIEWS - 1)
     steep = z.abs() > math.sin(MAX_ELEVATION)
-    sectors[steep] = torch.where(z[steep] > 0, VIEWS, VIEWS + 1)
+    places[steep] = torch.where(z[steep] > 0, VIEWS, VIEWS + 1)
     late = _late(rays)
-    for sector, half in torch.stack((sectors, late.long()), -1).unique(dim=0).tolist():
-        pitch = 0.0 if sector < VIEWS else math.pi / 2 if sector == VIEWS else -math.pi / 2
-        yaw = (sector + 0.5) * width if sector < VIEWS else 0.0
-        rows = torch.nonzero((sectors == sector) & (late == half)).squeeze(-1)
-        yield _part(rays, rows, torch.stack((x, y, z), -1)[rows], _camera_axes(yaw, pitch))
+    for place, half in torch.stack((places, late.long()), -1).unique(dim=0).tolist():
+        rows = torch.nonzero((places == place) & (late == half)).squeeze(-1)
+        yield _part(rays, rows, directions[rows], _camera_axes(*_VIEW_ANGLES[place]))
 
 
 def _late(rays: Rays) -> Bool[Tensor, " n"]:

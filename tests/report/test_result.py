@@ -7,11 +7,11 @@ import pytest
 
 from sparsestreet.records.costs import EffectGain, update_costs
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
-from sparsestreet.records.geometry import Geometry, RangeErrors
+from sparsestreet.records.geometry import RangeErrors
 from sparsestreet.records.run import EffectDecision
 from sparsestreet.records.summary import HELD_OUT, MetricSummary
 from sparsestreet.report.result import result_lines
-from tests.evaluation.frames import disturbed, make_summary
+from tests.evaluation.frames import disturbed, make_summary, with_ranges
 
 
 def test_what_a_run_came_to():
@@ -27,21 +27,14 @@ def test_what_a_run_came_to():
 
 
 def test_ranges_are_said_where_lidar_measured_them():
-    errors = RangeErrors(900, 800, 0.1304, 0.45, 0.654, 0.33)
-    found = Geometry(
-        split="held_out", sweeps=(5, 15), strides=(2, 2), pixel=0.2,
-        groups={"all": errors, "seen": errors, "vehicles": dataclasses.replace(errors, median=0.0931)},
-    )  # fmt: skip
-    lines = result_lines(dataclasses.replace(make_summary("plain"), geometry=found), Path("a"))
+    vehicles = RangeErrors(90, 90, 0.0931, 0.2, 0.646, 0.1)
+    lines = result_lines(with_ranges(make_summary("plain"), 0.1304, 0.654, vehicles=vehicles), Path("a"))
     assert lines[1] == (
         "ranges along the rays of 2 held-out sweeps: median error in images 0.130 m (65 % within 0.2 m), "
         "on vehicles 0.093 m (65 % within 0.2 m)"
     )
-    unmet = dataclasses.replace(errors, drawn=0, median=None, mean=None, within=0.0, chamfer=None)
-    none = dataclasses.replace(found, groups={"all": unmet, "seen": unmet})
-    assert not any(
-        "ranges" in line for line in result_lines(dataclasses.replace(make_summary(), geometry=none), Path())
-    )
+    none = result_lines(with_ranges(make_summary("plain"), None, 0.0), Path("a"))
+    assert not any("ranges" in line for line in none)
 
 
 @pytest.mark.parametrize(("psnr", "training"), [(None, 26.0), (25.0, None)])

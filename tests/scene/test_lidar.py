@@ -1,5 +1,6 @@
 """Ranges along rays: against the textbook's median, and against balls and walls whose distances are known by hand."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -210,7 +211,7 @@ def test_no_range_is_a_nan():
         ({"spacing": (0.4, 0.0)}, r"spacing must lie in \[0.0001, pi\) radians"),
     ):
         with pytest.raises(ValueError, match=message):
-            Rays(**{"directions": directions, "world_from_lidar": crooked_pose(), "spacing": SPACING} | wrong)
+            dataclasses.replace(rays, **wrong)
     timed = Rays(directions, torch.eye(4).double(), SPACING, torch.zeros(1))
     with pytest.raises(ValueError, match="rays with seconds need those of the log from time 0 to 1, got duration None"):
         render_ranges(scene_of(random_rows(3, 0)), timed, 0.0, OPTIONS)
