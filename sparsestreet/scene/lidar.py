@@ -183,7 +183,7 @@ def _part(
     seconds = 0.0 if rays.seconds is None else float(rays.seconds[rows].median())
     camera_from_lidar = torch.eye(4, dtype=torch.float64)
     camera_from_lidar[:3, :3] = axes
-    camera_from_world = camera_from_lidar @ inverse(rays.pose(seconds).double())
+    camera_from_world = camera_from_lidar @ inverse(rays.pose(seconds).cpu().double())
     camera = Camera(camera_from_world.float(), intrinsics.float(), width, height)
     return _Part(rows.to(rays.directions.device), camera, image - corner, along[:, 2], seconds)
 

@@ -13,7 +13,7 @@ from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation import geometry
 from sparsestreet.evaluation.geometry import measure_geometry, range_errors
-from sparsestreet.records.geometry import DISTANCES, Geometry, RangeErrors
+from sparsestreet.records.geometry import Geometry, RangeErrors
 from sparsestreet.records.summary import HELD_OUT, SUMMARY, TRAINING
 from sparsestreet.report.result import result_lines
 from sparsestreet.scene.graph import SceneGraph
@@ -121,9 +121,9 @@ def test_sweeps_and_returns_are_thinned_evenly(monkeypatch):
     monkeypatch.setattr(geometry, "MAX_SWEEPS", 2)
     thinned = measured(*(sweep(index) for index in (1, 2, 3)), held_out=frozenset({1, 2, 3}))
     assert (thinned.sweeps, thinned.strides) == ((1, 3), (3, 3))
-    assert {name: thinned.groups[name].returns for name in DISTANCES if name in thinned.groups} == {
-        "0-10 m": 2, "40+ m": 2,
-    }  # fmt: skip
+    # The first and the fourth return of two sweeps; only the first is seen, and boxes are of another frame.
+    returns = {name: errors.returns for name, errors in thinned.groups.items()}
+    assert returns == {"all": 4, "seen": 2, "unseen": 2, "0-10 m": 2, "40+ m": 2}
 
 
 def test_returns_of_the_recording_car_are_left_out_and_the_origin_is_no_ray():

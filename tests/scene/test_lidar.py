@@ -102,6 +102,16 @@ def test_a_ray_to_the_middle_of_a_ball_ends_there(standing):
     assert bool(found.returned.all())
 
 
+def test_views_are_twice_as_fine_as_the_rays_are_apart():
+    """In the middle of a view, along both axes; the image is no larger than it must be."""
+    beside, above = (math.degrees(one) for one in SPACING)
+    directions = unit(torch.tensor([22.5, 22.5, 22.5 + beside]), torch.tensor([0.0, above, 0.0]))
+    (part,) = lidar._fan(Rays(directions.float(), crooked_pose(), SPACING))
+    steps = (part.positions[1:] - part.positions[:1]).abs()
+    torch.testing.assert_close(steps, torch.tensor([[0.0, 2.0], [2.0, 0.0]]).double(), rtol=0, atol=1e-3)
+    assert (part.camera.width, part.camera.height) == (6, 6)  # two pixels, and 1.5 on each side, rounded up
+
+
 def wall_and_box() -> SceneGraph:
     """In the frame of the lidar: a wall at x = 10 m, before it the front of a box at 5 m, 1 m wide and high."""
 
