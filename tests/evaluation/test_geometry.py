@@ -119,11 +119,11 @@ def test_sweeps_of_held_out_instants_count_and_of_training_where_none_is():
 def test_sweeps_and_returns_are_thinned_evenly(monkeypatch):
     monkeypatch.setattr(geometry, "MAX_RAYS", 2)
     monkeypatch.setattr(geometry, "MAX_SWEEPS", 2)
-    thinned = measured(*(sweep(index) for index in (1, 2, 3)), held_out=frozenset({1, 2, 3}))
+    thinned = measured(*(sweep(index, seen=[0, 3]) for index in (1, 2, 3)), held_out=frozenset({1, 2, 3}))
     assert (thinned.sweeps, thinned.strides) == ((1, 3), (3, 3))
-    # The first and the fourth return of two sweeps; only the first is seen, and boxes are of another frame.
+    # The first and the fourth return of two sweeps, the two that are seen; boxes are of another frame.
     returns = {name: errors.returns for name, errors in thinned.groups.items()}
-    assert returns == {"all": 4, "seen": 2, "unseen": 2, "0-10 m": 2, "40+ m": 2}
+    assert returns == {"all": 4, "seen": 4, "0-10 m": 2, "40+ m": 2}
 
 
 def test_returns_of_the_recording_car_are_left_out_and_the_origin_is_no_ray():
