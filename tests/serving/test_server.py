@@ -270,7 +270,7 @@ def test_bytes_that_are_no_message_get_a_status(client):
 
 def test_a_call_that_never_ends_its_message_gives_its_place_back(tmp_path, monkeypatch):
     """Four take all workers and all places; one that is closed without a message is told so."""
-    monkeypatch.setattr("sparsestreet.serving.server.WHOLE_MESSAGE", 0.5)
+    monkeypatch.setattr("sparsestreet.serving.standard.WHOLE_MESSAGE", 0.5)
     monkeypatch.setattr("sparsestreet.serving.server.MAX_WAITING", 4)
     runs = named_runs([write_run(tmp_path / "street")])
     server, port = start(Scenes(runs, load_scene, memory=10**9), "127.0.0.1", 0, workers=4)

@@ -1,0 +1,113 @@
+"""gRPC's standard services, health and reflection: they answer on threads of their own, while pictures are rendered."""
+
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NoReturn
+
+import grpc
+
+from sparsestreet.serving import wire
+from sparsestreet.serving.interface import reflected
+
+WHOLE_MESSAGE = 60.0
+"""Seconds within which the next message of a call must have come; a call without one holds a place of all."""
+MAX_WATCHERS = 256
+"""Calls that watch how the server is, at the same time; they stay open and hold no thread."""
+_THREADS = 8
+"""A tool holds one for as long as it asks what the server has."""
+_LONGEST_DETAILS = 1000
+"""Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
+
+
+def standard_handlers() -> list[grpc.GenericRpcHandler]:
+    """Return the handlers of ``grpc.health.v1.Health``, and of both versions of ``ServerReflection``."""
+    threads = ThreadPoolExecutor(_THREADS, "standard")
+    watch = partial(_watch, threading.Semaphore(MAX_WATCHERS))
+    health = {
+        "Check": (grpc.stream_unary_rpc_method_handler, partial(_check)),
+        "Watch": (grpc.stream_stream_rpc_method_handler, watch),
+    }
+    reflection = {"ServerReflectionInfo": (grpc.stream_stream_rpc_method_handler, partial(_reflect))}
+    # grpcio's own health service sets both, too: a thread a call that stays open would soon be all of them.
+    for _, call in (*health.values(), *reflection.values()):
+        call.experimental_thread_pool = threads
+    watch.experimental_non_blocking = True
+    kinds = ("HealthCheckRequest", "HealthCheckResponse")
+    made = [_service("grpc.health.v1", "Health", health, *kinds)]
+    kinds = ("ServerReflectionRequest", "ServerReflectionResponse")
+    return [*made, *(_service(package, "ServerReflection", reflection, *kinds) for package in wire.REFLECTIONS)]
+
+
+def _service(package: str, name: str, calls: dict[str, Any], request: str, answer: str) -> grpc.GenericRpcHandler:
+    made = {call: handler(make, behavior, f"{package}.{request}", f"{package}.{answer}")
+            for call, (make, behavior) in calls.items()}  # fmt: skip
+    return grpc.method_handlers_generic_handler(f"{package}.{name}", made)
+
+
+def handler(make: Callable[..., grpc.RpcMethodHandler], call: Any, request: str, answer: str) -> grpc.RpcMethodHandler:
+    """Return the handler of a call; all take a stream of messages, so that the wait for each has an end."""
+    return make(
+        call,
+        request_deserializer=wire.kind(request).FromString,
+        response_serializer=wire.kind(answer).SerializeToString,
+    )
+
+
+def next_message(requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
+    """Return the next message of a call, None behind its last; a sender that keeps all waiting ends the call."""
+    late = threading.Timer(WHOLE_MESSAGE, context.cancel)
+    late.start()
+    try:
+        return next(requests, None)
+    finally:
+        late.cancel()
+
+
+def only_message(requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
+    """Return the one message of a call."""
+    request = next_message(requests, context)
+    if request is None:
+        refuse(context, grpc.StatusCode.INVALID_ARGUMENT, "the call has no message: send one")
+    return request
+
+
+def refuse(context: grpc.ServicerContext, code: grpc.StatusCode, said: str) -> NoReturn:
+    """End a call with a status."""
+    context.abort(code, said[:_LONGEST_DETAILS])
+    raise AssertionError("abort raises")
+
+
+def _is_served(request: Any) -> bool:
+    return request.service in ("", *wire.SERVICES)
+
+
+def _check(requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
+    request = only_message(requests, context)
+    if not _is_served(request):
+        refuse(context, grpc.StatusCode.NOT_FOUND, f"there is no service {request.service!r}")
+    return wire.kind("grpc.health.v1.HealthCheckResponse")(status="SERVING")
+
+
+def _watch(
+    places: threading.Semaphore,
+    requests: Iterator[Any],
+    context: grpc.ServicerContext,
+    send_response_callback: Callable[[Any], None],
+) -> None:
+    """Say once how a service is; the call stays open until one side goes, for nothing changes before."""
+    request = only_message(requests, context)
+    if not places.acquire(blocking=False):
+        said = f"{MAX_WATCHERS} calls watch already: end some, or call Check"
+        refuse(context, grpc.StatusCode.RESOURCE_EXHAUSTED, said)
+    if not context.add_callback(places.release):
+        places.release()  # it went meanwhile
+        return
+    status = "SERVING" if _is_served(request) else "SERVICE_UNKNOWN"
+    send_response_callback(wire.kind("grpc.health.v1.HealthCheckResponse")(status=status))
+
+
+def _reflect(requests: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
+    while (request := next_message(requests, context)) is not None:
+        yield reflected(request)
