@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NoReturn
 
 import grpc
+from google.protobuf.message import DecodeError
 
 from sparsestreet.serving import wire
 from sparsestreet.serving.interface import reflected
@@ -50,9 +51,17 @@ def handler(make: Callable[..., grpc.RpcMethodHandler], call: Any, request: str,
     """Return the handler of a call; all take a stream of messages, so that the wait for each has an end."""
     return make(
         call,
-        request_deserializer=wire.kind(request).FromString,
+        request_deserializer=partial(_read, wire.kind(request)),
         response_serializer=wire.kind(answer).SerializeToString,
     )
+
+
+def _read(kind: Any, data: bytes) -> Any:
+    """The message, or the error, which ``next_message`` answers: gRPC would log a trace for each."""
+    try:
+        return kind.FromString(data)
+    except DecodeError as error:
+        return error
 
 
 def next_message(requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
@@ -60,9 +69,12 @@ def next_message(requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
     late = threading.Timer(WHOLE_MESSAGE, context.cancel)
     late.start()
     try:
-        return next(requests, None)
+        request = next(requests, None)
     finally:
         late.cancel()
+    if isinstance(request, DecodeError):
+        refuse(context, grpc.StatusCode.INVALID_ARGUMENT, f"{request}: make messages of `serve --proto`")
+    return request
 
 
 def only_message(requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
