@@ -22,7 +22,7 @@ MAX_REMARKS = 1000
 
 
 class Remarks:
-    """Says each thing once: of a scene's cameras, and of each object that requests name."""
+    """What was said already: of a scene's cameras, and of each object that requests name."""
 
     def __init__(self) -> None:
         self._said: set[tuple[str, ...]] = set()

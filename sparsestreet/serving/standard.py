@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NoReturn
 
@@ -22,19 +23,28 @@ _LONGEST_DETAILS = 1000
 """Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
 
 
+@dataclass(frozen=True)
+class _Beside:
+    """A call on threads of its own, marked as grpcio's own health service marks its calls."""
+
+    call: Callable[..., Any]
+    experimental_thread_pool: ThreadPoolExecutor
+    experimental_non_blocking: bool = False
+    """Whether the call stays open after it returned: one that waits would hold a thread."""
+
+    def __call__(self, *told: Any, **named: Any) -> Any:
+        return self.call(*told, **named)
+
+
 def standard_handlers() -> list[grpc.GenericRpcHandler]:
     """Return the handlers of ``grpc.health.v1.Health``, and of both versions of ``ServerReflection``."""
     threads = ThreadPoolExecutor(_THREADS, "standard")
-    watch = partial(_watch, threading.Semaphore(MAX_WATCHERS))
+    watch = _Beside(partial(_watch, threading.Semaphore(MAX_WATCHERS)), threads, experimental_non_blocking=True)
     health = {
-        "Check": (grpc.stream_unary_rpc_method_handler, partial(_check)),
+        "Check": (grpc.stream_unary_rpc_method_handler, _Beside(_check, threads)),
         "Watch": (grpc.stream_stream_rpc_method_handler, watch),
     }
-    reflection = {"ServerReflectionInfo": (grpc.stream_stream_rpc_method_handler, partial(_reflect))}
-    # grpcio's own health service sets both, too: a thread a call that stays open would soon be all of them.
-    for _, call in (*health.values(), *reflection.values()):
-        call.experimental_thread_pool = threads
-    watch.experimental_non_blocking = True
+    reflection = {"ServerReflectionInfo": (grpc.stream_stream_rpc_method_handler, _Beside(_reflect, threads))}
     kinds = ("HealthCheckRequest", "HealthCheckResponse")
     made = [_service("grpc.health.v1", "Health", health, *kinds)]
     kinds = ("ServerReflectionRequest", "ServerReflectionResponse")

@@ -6,6 +6,7 @@ import pytest
 
 from sparsestreet.scene.edits.ground import Ground
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes import Tracked
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.serving import remarks
@@ -21,6 +22,7 @@ def street(tmp_path_factory) -> ServedScene:
     """The tram's name is that of a found object. Both are boxes of 1 m whose feet are at 0.5 m."""
     made = served(tmp_path_factory.mktemp("runs") / "street")
     node = made.stored.scene.nodes["rigid"]
+    assert isinstance(node, Tracked)
     node.names = ("car", "found_1")
     return made
 

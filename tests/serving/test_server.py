@@ -249,6 +249,18 @@ def test_errors_are_statuses_and_the_server_goes_on(client, changes, code, said)
     assert picture(client, view)
 
 
+def test_the_log_says_which_objects_float_or_are_not_there(client, caplog):
+    request = request_for(timed_views()[8])
+    place(request, "tram", at(9.0, 0.0, 5.5))
+    client.render_rgb(theirs(request))
+    place(request, "trams", at(9.0, 0.0, 1.0))
+    with pytest.raises(grpc.RpcError, match="no object 'trams'"):
+        client.render_rgb(theirs(request))
+    floats, refused = caplog.messages
+    assert re.match(r"street: tram is [45]\.\d m above the ground", floats)
+    assert refused == "street: requests that name trams are refused: there is no such object"
+
+
 def test_an_error_that_repeats_a_long_name_is_still_its_status(client):
     request = request_for(timed_views()[0])
     place(request, "x" * 100_000, at(0.0, 0.0, 0.0))
