@@ -80,6 +80,8 @@ class Ranges:
     """Meters along each ray; infinite where more than half of the light passes all Gaussians."""
     alpha: Float[Tensor, " n"]
     """Coverage up to the Gaussian that is met, or by all of them."""
+    seconds: Float64[Tensor, " n"]
+    """Since the instant of the sweep: when the view of each ray sees sensor and objects."""
 
     @property
     def returned(self) -> Bool[Tensor, " n"]:
@@ -99,6 +101,7 @@ def render_ranges(
     """Draw the median range along each ray, without gradients.
 
     Rays that were fired at different times are drawn where sensor and objects are at the median time of their view.
+    Before and after the log, objects stand still.
 
     Args:
         scene: what is looked at.
@@ -116,13 +119,15 @@ def render_ranges(
         )
     like = rays.directions
     ranges, alpha = like.new_full((len(like),), torch.inf), like.new_zeros(len(like))
+    seconds = torch.zeros_like(alpha, dtype=torch.float64)
     for part in _fan(rays):
         moment = 0.0 if duration is None else part.seconds / duration
-        placed = scene.gaussians_at(View(part.camera, time + moment))
+        placed = scene.gaussians_at(View(part.camera, min(max(time + moment, 0.0), 1.0)))
         depths, alphas = _at(*_median_depth(placed.gaussians, part.camera, options), part.positions.to(scene.device))
         ranges[part.rows] = (depths / part.cosines.to(depths)).to(like)
         alpha[part.rows] = alphas.to(like)
-    return Ranges(ranges, alpha)
+        seconds[part.rows] = part.seconds
+    return Ranges(ranges, alpha, seconds)
 
 
 @dataclass(frozen=True)
