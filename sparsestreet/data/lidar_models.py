@@ -21,9 +21,6 @@ MAX_RAYS = 2_000_000
 """Of a turn: several times what the finest lidar has, and some hundred megabytes while they are drawn."""
 MAX_SECONDS = 10.0
 """A turn lasts."""
-MIN_STEP, MAX_STEP = math.radians(0.2), math.radians(0.4)
-"""Between the rays that views are made for, two pixels each: coarser ones mix surfaces, finer ones only take longer
-(docs/metrics.md)."""
 
 
 @dataclass(frozen=True)
@@ -69,13 +66,6 @@ class LidarModel:
     def is_clockwise(self) -> bool:
         """Whether it turns from y to x, seen from above."""
         return bool((self._steps < 0).all())
-
-    @property
-    def spacing(self) -> tuple[float, float]:
-        """Radians between columns, and between rows where most of them lie, as views need them."""
-        rows = self.row_elevations.sort().values.diff()
-        beside, above = (float(one.abs().median()) if len(one) else MAX_STEP for one in (self._steps, rows))
-        return min(max(MIN_STEP, beside), MAX_STEP), min(max(MIN_STEP, above), MAX_STEP)
 
     def directions(self) -> Float64[Tensor, "n 3"]:
         """Return the unit vectors of all rays as they are fired: column by column, in it row by row."""

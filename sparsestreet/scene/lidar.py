@@ -31,6 +31,8 @@ _VIEW_ANGLES += [(0.0, math.pi / 2), (0.0, -math.pi / 2)]
 """Yaw and pitch of the optical axes, radians: level ones, the zenith and the nadir."""
 PIXELS = 2
 """Along each axis from one ray to the next. The op blurs by about a pixel, so one would mix what two rays meet."""
+PIXEL = math.radians(0.2)
+"""Angle of a pixel that suffices. Finer ones make no smaller errors (docs/metrics.md), and take longer."""
 MIN_SPACING = 1e-4
 """Radians between rays, a tenth of the finest lidar's: nobody has the memory for pixels much finer."""
 EDGE = 1.2
@@ -152,10 +154,10 @@ def _fan(rays: Rays) -> Iterator[_Part]:
     places = (VIEWS * turns).long().clamp(max=VIEWS - 1)
     steep = z.abs() > math.sin(MAX_ELEVATION)
     places[steep] = torch.where(z[steep] > 0, VIEWS, VIEWS + 1)
-    late = _late(rays)
-    for place, half in torch.stack((places, late.long()), -1).unique(dim=0).tolist():
-        rows = torch.nonzero((places == place) & (late == half)).squeeze(-1)
-        yield _part(rays, rows, directions[rows], _camera_axes(*_VIEW_ANGLES[place]))
+    views = 2 * places + _late(rays)
+    for view in views.unique().tolist():
+        rows = torch.nonzero(views == view).squeeze(-1)
+        yield _part(rays, rows, directions[rows], _camera_axes(*_VIEW_ANGLES[view // 2]))
 
 
 def _late(rays: Rays) -> Bool[Tensor, " n"]:

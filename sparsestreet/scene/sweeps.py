@@ -10,7 +10,7 @@ from torch import Tensor
 from sparsestreet.data.lidar_models import LidarModel
 from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.lidar import Rays, render_ranges
+from sparsestreet.scene.lidar import PIXEL, PIXELS, Rays, render_ranges
 from sparsestreet.scene.state import DEFAULT_OPTIONS, RenderOptions
 
 
@@ -56,7 +56,7 @@ def render_sweep(
     start, end = (-model.seconds / 2, model.seconds / 2) if span is None else span
     seconds = start + (end - start) * model.shares()
     directions = model.directions()
-    rays = Rays(directions.float(), world_from_lidar, model.spacing, seconds.float())
+    rays = Rays(directions.float(), world_from_lidar, (PIXELS * PIXEL, PIXELS * PIXEL), seconds.float())
     met = render_ranges(scene, rays, time, options, duration=duration)
     kept = met.ranges <= model.reach
     points = torch.zeros(int(kept.sum()), 3, dtype=torch.float64)

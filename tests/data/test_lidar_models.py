@@ -69,11 +69,6 @@ def test_every_name_of_a_lidar_is_its_own():
     assert [lidar_model(name).name for name in NAMES] == list(NAMES)
 
 
-def test_views_are_made_for_the_step_between_rays_within_limits():
-    assert [math.degrees(one) for one in lidar_model("waymo_top").spacing] == pytest.approx([0.2, 0.2618], abs=1e-4)
-    assert [math.degrees(one) for one in lidar_model("hdl32").spacing] == pytest.approx([0.3318, 0.4], abs=1e-4)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -114,4 +109,3 @@ def test_a_lidar_of_one_ray_is_a_lidar():
     zero = torch.zeros(1, dtype=torch.float64)
     model = LidarModel("one", zero, zero, zero, 0.1, math.inf, "by hand")
     assert model.directions().tolist() == [[1.0, 0.0, 0.0]]
-    assert [math.degrees(one) for one in model.spacing] == pytest.approx([0.4, 0.4])
