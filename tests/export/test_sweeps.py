@@ -10,6 +10,7 @@ import torch
 
 from sparsestreet.cli.commands.render import render
 from sparsestreet.data.lidar_models import LidarModel, lidar_model
+from sparsestreet.records.run import RIG, RigRecord
 from sparsestreet.scene.sweeps import Returns, render_sweep
 from tests.export.street import stored_street, write_street
 
@@ -98,7 +99,7 @@ def test_a_folder_has_a_sweep_a_frame_and_their_poses(run, model, tmp_path, caps
         assert len(rows) == one["returns"] == len(expected) > 20
         np.testing.assert_allclose(rows, expected, rtol=0, atol=2e-3)
     printed = capsys.readouterr().out
-    assert "the lidar is 1 m ahead, 0 m left, 1.9 m up of the car's origin" in printed
+    assert "the lidar is 1.00 m ahead, 0.00 m left, 1.90 m up of the car's origin, as roofs carry one" in printed
     assert "intensities are 0" in printed
     assert "5 sweeps of mine" in printed
 
@@ -112,6 +113,19 @@ def test_a_frame_alone_is_drawn_from_a_car_that_drives_on(run, model, tmp_path, 
     assert json.loads((tmp_path / "one_poses.json").read_text())["sweeps"][0]["file"] == f"one.{ending}"
     assert render([str(run), str(tmp_path / "many"), f"lidar={model.source}", "frames=1:2", f"format={ending}"]) == 0
     assert [path.name for path in sorted((tmp_path / "many").iterdir())] == [f"00000.{ending}", "poses.json"]
+
+
+def test_a_lidar_stands_where_that_of_the_log_stood(run, model, tmp_path, capsys):
+    place = tuple(lidar_at(3, mount=(0.7, 0.2, 2.1))[:3, 3].tolist())
+    unmoved = tuple(tuple(row) for row in np.eye(4).tolist())
+    record = RigRecord(
+        camera_names=(), dataset_from_world=unmoved, world_from_vehicle=None, vehicle_stamps=None, lidar=(*place, 0.75)
+    )
+    RIG.write(run, record)
+    assert render([str(run), str(tmp_path / "one.ply"), f"lidar={model.source}", "frames=1:2"]) == 0
+    assert "0.70 m ahead, 0.20 m left, 2.10 m up of the car's origin, as the log's" in capsys.readouterr().out
+    one = json.loads((tmp_path / "one_poses.json").read_text())["sweeps"][0]
+    np.testing.assert_allclose(one["world_from_lidar"], lidar_at(1, mount=(0.7, 0.2, 2.1)), rtol=0, atol=1e-5)
 
 
 def test_a_car_beside_the_path_without_an_object(run, model, tmp_path):

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from sparsestreet.export.sweeps import Mounted
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.scene.views import RecordedViews
+    from sparsestreet.serving.cameras import Rig
     from sparsestreet.types import View
 
 
@@ -92,7 +93,7 @@ the pictures:
 
 sweeps of a lidar, in place of pictures (docs/rendering.md):
   lidar     waymo_top, hdl64, hdl32, pandar64, at128, or a .json of its angles
-  mount     [ahead,left,up] in meters: the lidar over the rear axle on the ground (default: 1,0,1.9)
+  mount     [ahead,left,up] in meters: the lidar over the rear axle on the ground (default: as the log's)
   format    ply, pcd or bin, of the files of a folder (default: ply); bin is KITTI's and has no seconds
 """
 
@@ -280,7 +281,8 @@ def _mounted(
     from sparsestreet.scene.views import seconds_of
     from sparsestreet.serving.cameras import rig_of
 
-    rig = rig_of(views, rig_record(request.scene), frame_rate=log_fps)
+    record = rig_record(request.scene)
+    rig = rig_of(views, record, frame_rate=log_fps)
     vehicle_from = {one.index: np.linalg.inv(one.rig_from_camera) for one in rig.cameras}
     if request.frames is not None and request.path != "lane_change":
         path, _, _ = _path(replace(request, frames=None), views, log_fps)
@@ -288,12 +290,23 @@ def _mounted(
     for one in path:
         camera = rig.cameras[0].index if one[0].camera_index is None else one[0].camera_index
         vehicles.append(inverse(one[0].camera.camera_from_world.double()).numpy() @ vehicle_from[camera])
-    mount = request.mount or DEFAULT_MOUNT
-    if request.mount is None:
-        said = ", ".join(f"{one:g} m {where}" for one, where in zip(mount, ("ahead", "left", "up"), strict=True))
-        print(f"the lidar is {said} of the car's origin (mount=...)")
+    mount = request.mount or _known_mount(rig, None if record is None else record.lidar)
     times = [one[0].time for one in path]
     return mounted(model, times, vehicles, mount, seconds_of(views, log_fps))
+
+
+def _known_mount(rig: "Rig", place: Sequence[float] | None) -> tuple[float, ...]:
+    """Return where the log's lidar was on the car, or where others have theirs, and say so."""
+    import numpy as np
+
+    mount = DEFAULT_MOUNT
+    if place is not None:
+        *world, instant = place
+        mount = tuple((np.linalg.inv(rig.at(instant)) @ [*world, 1.0])[:3].tolist())
+    said = ", ".join(f"{one:.2f} m {where}" for one, where in zip(mount, ("ahead", "left", "up"), strict=True))
+    whose = "as roofs carry one" if place is None else "as the log's"
+    print(f"the lidar is {said} of the car's origin, {whose} (mount=...)")
+    return mount
 
 
 def _path(request: RenderRequest, views: "RecordedViews", log_fps: float) -> "tuple[CameraPath, float, str]":
