@@ -6,12 +6,13 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.commands.jobs import JobComposer, SweepCount, count_jobs
+from sparsestreet.cli.commands.jobs import SweepCount, count_jobs
 from sparsestreet.cli.commands.jobs import jobs as jobs_command
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import CONF, as_typed
 from sparsestreet.cli.config.validate import config_problem
 from sparsestreet.cli.runs import sweep
+from sparsestreet.cli.runs.jobs import JobComposer
 from sparsestreet.cli.runs.sweep import (
     OF_DRIVES,
     as_sweep,
