@@ -178,7 +178,7 @@ def _table(counts: Sequence[SweepCount], devices: int) -> Table:
     table.add_column("sweep", no_wrap=True)
     shards = [f"on {devices} devices"] if devices > 1 else []
     for heading in ("jobs", "finished", "to train", "in whole runs", "hours", *shards, "GB of memory", "GB on disk"):
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", min_width=max(map(len, heading.split())))
     for one in [*counts, _sum(counts)] if len(counts) > 1 else counts:
         numbers = map(str, (one.jobs, one.finished, one.trainings))
         hours = [one.hours, *([one.longest] if shards else ())]

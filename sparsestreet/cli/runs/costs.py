@@ -147,8 +147,8 @@ class Assumptions:
     devices: int = 1
 
     def __post_init__(self) -> None:
-        for name, value in (("ms_per_step", self.ms_per_step), ("gaussians", self.gaussians), ("devices", self.devices)):
-            if value is not None and not value > 0:
+        for name in ("ms_per_step", "gaussians", "devices"):
+            if (value := getattr(self, name)) is not None and not value > 0:
                 raise ValueError(f"{name} must be above 0, got {value}")
         if self.image is not None and not re.fullmatch(r"[1-9]\d*x[1-9]\d*", self.image):
             raise ValueError(f"image must be WIDTHxHEIGHT, such as 960x640, got {self.image!r}")

@@ -5,25 +5,32 @@ import os
 import re
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.config.compose import configuration, is_sweep, quoted, resolved, without_flags
 from sparsestreet.cli.runs.costs import Kind, kind_of
-from sparsestreet.cli.runs.folder import first_pruning, identity_of_trunk, moments_to_keep
-from sparsestreet.cli.runs.sweep import ALIKE, finished, jobs_of
+from sparsestreet.cli.runs.folder import (
+    first_pruning,
+    give_back_trunk,
+    identity_of_trunk,
+    is_whole,
+    moments_to_keep,
+)
+from sparsestreet.cli.runs.sweep import ALIKE, SweepFolder, finished, has_known_jobs, jobs_of
 from sparsestreet.naming import kept_before
 from sparsestreet.records.configuration import flat_config
 
 _EVERY = 5.0
 """Seconds after which a line says how far the count is: a composition takes one of a busy machine."""
+_SHARD = "shard="
 _OF_DRIVE = ("data.log.", "data.root", "seed")
 """Options that tell drives and seeds apart, or follow from them."""
 
@@ -48,6 +55,8 @@ class Job:
     """The fraction of it at which something is pruned first."""
     keeps: tuple[float, ...]
     """The moments before which it leaves a checkpoint."""
+    kept: bool
+    """Whether it keeps its checkpoints for good."""
     done: bool
     """Whether it stands finished in its folder."""
     kind: Kind
@@ -85,7 +94,7 @@ class JobComposer:
             del cfg["hydra"]
         cfg.folder = str(out)
         done = self.looks and out.is_dir() and finished(cfg, out) is not None
-        job = replace(_job(cfg, out, within, done=done), words=tuple(words))
+        job = _job(cfg, words, out, within, done=done)
         if job.prefix:
             self._known[key] = whole, job
         return job
@@ -125,9 +134,20 @@ def jobs_of_sweep(overrides: Sequence[str], looks: bool = True) -> Iterator[Job]
         yield composer.job(words, number)
 
 
-def _job(cfg: DictConfig, out: Path, within: str, done: bool) -> Job:
-    places = {"trunk": _folder(cfg.trunk), "counted": _folder(cfg.count_of)}
-    job = Job((), Path(os.path.normpath(out)), within, (), **places, first=0.0, keeps=(), done=done, kind=kind_of(cfg))
+def _job(cfg: DictConfig, words: Sequence[str], out: Path, within: str, done: bool) -> Job:
+    job = Job(
+        words=tuple(words),
+        out=Path(os.path.normpath(out)),
+        within=within,
+        prefix=(),
+        trunk=_folder(cfg.trunk),
+        counted=_folder(cfg.count_of),
+        first=0.0,
+        keeps=(),
+        kept=cfg.keep_checkpoints,
+        done=done,
+        kind=kind_of(cfg),
+    )
     try:
         config = flat_config(resolved(cfg))
         read, first = str(OmegaConf.to_container(cfg.data.log, resolve=True)), first_pruning(config)
@@ -153,7 +173,7 @@ class Shard:
             raise ValueError(f"shard={self.number}/{self.count} is none: give shard=K/N with 1 <= K <= N")
 
     @classmethod
-    def parse(cls, text: str) -> Self:
+    def parse(cls, text: str) -> "Shard":
         """Return the shard of a word such as "3/16". Raises ValueError for another word."""
         found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text)
         if found is None:
@@ -180,12 +200,74 @@ def dealt(jobs: Sequence[Job], count: int) -> list[list[Job]]:
     return shards
 
 
-def trunks_done(jobs: Sequence[Job], whole: Mapping[Path, bool]) -> list[Path]:
-    """Return the folders of trunks of which every branch in ``jobs`` stands finished.
+def without_shard(arguments: list[str]) -> tuple[Shard | None, list[str]]:
+    """Return what ``shard=K/N`` asks for, and the other arguments. Raises ValueError for a word that is none."""
+    said = [text for text in arguments if text.startswith(_SHARD)]
+    shard = Shard.parse(said[-1].removeprefix(_SHARD)) if said else None
+    return shard, [text for text in arguments if text not in said]
+
+
+def shard_problem(shard: Shard | None, arguments: list[str]) -> str | None:
+    """Return in one line why these arguments have no shards; None where none is asked for, or they have."""
+    if shard is None:
+        return None
+    if not has_known_jobs(arguments):
+        return "shard=K/N takes jobs of a sweep whose jobs are known: name a sweep, without a sweeper of your own"
+    if any(text.startswith(("hydra/launcher=", "hydra.launcher.")) for text in arguments):
+        return "a shard trains its jobs one after the other: leave out the launcher, or shard=K/N"
+    with configuration():
+        given = [text for text in without_flags(arguments) if not is_sweep(text)]
+        cfg: Any = OmegaConf.to_container(compose("train", given, return_hydra_config=True).hydra)
+        if "${now:" in cfg["sweep"]["dir"]:
+            return "shards write into one folder, and this sweep names a new one: give hydra.sweep.dir=DIR"
+    return None
+
+
+def jobs_of_shard(shard: Shard, arguments: list[str]) -> list[Job]:
+    """Return the jobs of a shard of the sweep that the arguments name, and say how many they are."""
+    with configuration():
+        jobs = list(jobs_of_sweep(without_flags(arguments), looks=False))
+    own = dealt(jobs, shard.count)[shard.number - 1]
+    said = f"sparsestreet train: shard {shard.number} of {shard.count} has {len(own)} of {len(jobs)} jobs"
+    print(said, file=sys.stderr, flush=True)
+    return own
+
+
+def words_of_job(job: Job) -> list[str]:
+    """Return the arguments of a sweep of this one job, into the folder that it has in the whole sweep."""
+    return ["-m", *job.words, f"hydra.sweep.subdir={quoted(job.within)}"]
+
+
+def give_back_trunks(arguments: list[str], own: Sequence[Job] | None) -> None:
+    """Remove the checkpoints of trunks all of whose branches stand finished.
 
     Args:
-        jobs: of the whole sweep, or of a whole shard of it.
-        whole: folder of a job -> whether it holds a finished run.
+        arguments: of the sweep; any others are none, and nothing happens.
+        own: the jobs of a shard; None: those of the whole sweep.
     """
-    branches = {job.trunk: [one.out for one in jobs if one.trunk == job.trunk] for job in jobs if job.trunk}
-    return [trunk for trunk, outs in branches.items() if whole.get(trunk) and all(whole[out] for out in outs)]
+    if SweepFolder.folder is None or not has_known_jobs(arguments):
+        return
+    words = without_flags(arguments)
+    with configuration():
+        cfg: Any = OmegaConf.to_container(compose("train", [text for text in words if not is_sweep(text)]))
+        if not cfg["trunk"]:
+            return
+        # A folder that is named by the clock is that of this sweep.
+        place = f"hydra.sweep.dir={quoted(str(SweepFolder.folder))}"
+        own = list(jobs_of_sweep([*words, place], looks=False)) if own is None else own
+    for trunk in trunks_done(own):
+        give_back_trunk(trunk)
+
+
+def trunks_done(jobs: Sequence[Job]) -> list[Path]:
+    """Return the folders of trunks that stand finished with every branch among the jobs, and keep no checkpoints."""
+    branches: dict[Path, list[Job]] = {}
+    for job in jobs:
+        if job.trunk is not None:
+            branches.setdefault(job.trunk, []).append(job)
+    own = {job.out: job for job in jobs}
+    return [
+        trunk
+        for trunk, found in branches.items()
+        if trunk in own and not own[trunk].kept and all(is_whole(job.out) for job in (own[trunk], *found))
+    ]
