@@ -153,7 +153,7 @@ def _count(name: str, jobs: Sequence[Job], runs: Sequence[MeasuredRun], said: As
 
 def _total(values: Iterable[float | None]) -> float | None:
     known = list(values)
-    return None if None in known else sum(value for value in known if value is not None)
+    return None if None in known else sum((value for value in known if value is not None), 0.0)
 
 
 def _largest(values: Iterable[float | None]) -> float | None:

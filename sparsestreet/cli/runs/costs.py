@@ -2,10 +2,11 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, cast
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -18,11 +19,13 @@ LIKE = (
     *("method.name", "preset.name", "capacity.name", "trainer.accelerator", "trainer.strategy._target_"),
     *("data.log._target_", "data.log.width", "data.log.settings.width", "data.log.settings.height"),
 )
-"""Options in which a measured run must agree with a job, beside limits of Gaussians that the job says."""
+"""Options in which a measured run must agree with a job, beside limits of Gaussians."""
 _TRAINS = ("train", "validate", "save")
 """Phases of a run that take as long as it has steps; the others come once."""
 _WIDTHS = {"velocities": 3, "life_peaks": 1, "log_life_spans": 1}
 """Numbers that a Gaussian of a vibrating node has beside those of every other."""
+OF_ANOTHER_RUN = "of another run"
+"""Stands for a value that follows from a run that is counted (``count_of``)."""
 _MANY = 10**6
 """Training images of a log on which all depends that grows with the log."""
 
@@ -46,6 +49,8 @@ class Kind:
     """Whether some steps render a second view."""
     size: tuple[int, int] | None
     """Width and height of an image in px; None: the log says it."""
+    limits_of: Callable[[int | None], Mapping[str, Setting]] = field(compare=False)
+    """Training images of a log -> node -> ``max_gaussians`` that the job would have there."""
 
 
 def kind_of(cfg: DictConfig) -> Kind:
@@ -65,22 +70,47 @@ def kind_of(cfg: DictConfig) -> Kind:
         row_bytes=4 * numbers,
         moved=cfg.moved_views is not None,
         size=(width, height) if width and height else None,
+        limits_of=_limits_of(cfg),
     )
 
 
 def _fixed_value(cfg: DictConfig) -> Callable[[str], Any]:
     """Return what reads a value: None where it grows with the log, or cannot be known yet."""
-    known = cfg.copy()
-    known.training_views.images = _MANY
+    known = _with_images(cfg, _MANY)
 
     def value(key: str) -> Any:
-        try:
-            found = OmegaConf.select(cfg, key)
-            return found if found == OmegaConf.select(known, key) else None
-        except (OmegaConfBaseException, ValueError):
-            return None
+        found = _selected(cfg, key)
+        return None if found == OF_ANOTHER_RUN or found != _selected(known, key) else found
 
     return value
+
+
+def _limits_of(cfg: DictConfig) -> Callable[[int | None], Mapping[str, Setting]]:
+    """Return what tells ``max_gaussians`` of each node by the number of training images."""
+    uncounted = cfg.copy()
+    uncounted.count_of = None
+
+    @cache
+    def limits(images: int | None) -> Mapping[str, Setting]:
+        own, free = _with_images(cfg, images), _with_images(uncounted, images)
+        found = {name: _selected(own, f"node.{name}.max_gaussians") for name in cfg.node or ()}
+        alike = {name for name, limit in found.items() if limit == _selected(free, f"node.{name}.max_gaussians")}
+        return {name: limit if name in alike else OF_ANOTHER_RUN for name, limit in found.items()}
+
+    return limits
+
+
+def _with_images(cfg: DictConfig, images: int | None) -> DictConfig:
+    known = cfg.copy()
+    known.training_views.images = images
+    return known
+
+
+def _selected(cfg: DictConfig, key: str) -> Any:
+    try:
+        return OmegaConf.select(cfg, key)
+    except (OmegaConfBaseException, ValueError):
+        return OF_ANOTHER_RUN
 
 
 @dataclass(frozen=True)
@@ -105,9 +135,13 @@ class MeasuredRun:
         return (self.seconds - self.training + self.training * scale * share) / 3600
 
     def is_like(self, kind: Kind) -> bool:
-        """Whether a job of this kind has the method, preset, size, device and limits of this run."""
-        limited = all(self.config.get(f"node.{name}.max_gaussians") == limit for name, limit in kind.limits)
-        return limited and tuple(self.config.get(key) for key in LIKE) == kind.like
+        """Return whether the run has the method, preset, size and device of a job, and the limits that it would have on
+        this log."""
+        if tuple(self.config.get(key) for key in LIKE) != kind.like:
+            return False
+        limits = kind.limits_of(cast(int | None, self.config.get("training_views.images")))
+        own = {name: self.config.get(f"node.{name}.max_gaussians") for name in limits}
+        return all(limit in (own[name], OF_ANOTHER_RUN) for name, limit in limits.items())
 
 
 def measured_runs(folders: Iterable[Path]) -> list[MeasuredRun]:
@@ -215,11 +249,11 @@ def _counted(kind: Kind, share: float, said: Assumptions) -> Mapping[str, Cost]:
 def _step_bytes(kind: Kind, rows: int, size: tuple[int, int]) -> float:
     from sparsestreet.training.forecast import foreseen_bytes  # torch
 
-    return foreseen_bytes(rows, kind.row_bytes, size[0] * size[1], moved=kind.moved)
+    return foreseen_bytes(rows, float(kind.row_bytes), size[0] * size[1], moved=kind.moved)
 
 
 def _source(value: float | None, known: str, needed: Mapping[str, object]) -> str:
     if value is not None:
         return known
     absent = [word for word, found in needed.items() if found is None]
-    return f"unknown, as no finished run is like them: give measured=DIR, or {' '.join(absent)}"
+    return f"unknown, as no finished run is like them: give measured=DIR, or {' with '.join(absent)}"
