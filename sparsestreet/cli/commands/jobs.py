@@ -25,8 +25,8 @@ sparsestreet jobs -m key=value,value [key=value ...] [...]
 
 What sweeps of conf/sweep, or one of the command line, would train, with the options that train would get; nothing is
 trained or written. A job that stands finished in its folder is not trained again. In a sweep that names a trunk
-(conf/train.yaml), a job that differs from it only in what it prunes begins with its checkpoint (branch_points): "in
-whole runs" counts so. Drives need not be there: data.root=a,b,c counts three, and data.root=@FILE the folders that the
+(conf/train.yaml), a job that differs from it only in what it prunes begins with its checkpoint (branch_points): "whole
+runs" counts so. Drives need not be there: data.root=a,b,c counts three, and data.root=@FILE the folders that the
 lines of a file name.
 
 Hours, memory and disk of the jobs that are left come from finished runs in the sweep's folder and in measured=DIR. A
@@ -41,6 +41,8 @@ would fill it. "hours" are those of one device; with devices=N also the hours of
 
 COMMAND_LINE = "-m"
 """What a sweep is called that no file of conf/sweep holds."""
+_MIN_WIDTH = 100
+"""Letters of a line: no column is cut where a terminal has fewer."""
 QUANTITIES = ("hours", "memory", "disk")
 
 
@@ -100,7 +102,8 @@ def jobs(arguments: list[str]) -> int:
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         print(f"sparsestreet jobs: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
-    Console().print(_table(counts, said.devices))
+    console = Console()
+    console.print(_table(counts, said.devices), width=max(console.width, _MIN_WIDTH), crop=False)
     for line in _sources(counts):
         print(line)
     return 0
@@ -174,11 +177,11 @@ def _sum(counts: Sequence[SweepCount]) -> SweepCount:
 
 
 def _table(counts: Sequence[SweepCount], devices: int) -> Table:
-    table = Table(box=None)
+    table = Table(box=None, pad_edge=False)
     table.add_column("sweep", no_wrap=True)
-    shards = [f"on {devices} devices"] if devices > 1 else []
-    for heading in ("jobs", "finished", "to train", "in whole runs", "hours", *shards, "GB of memory", "GB on disk"):
-        table.add_column(heading, justify="right", min_width=max(map(len, heading.split())))
+    shards = [f"on {devices}\ndevices"] if devices > 1 else []
+    for heading in ("jobs", "finished", "to\ntrain", "whole\nruns", "hours", *shards, "GB of\nmemory", "GB on\ndisk"):
+        table.add_column(heading, justify="right", no_wrap=True)
     for one in [*counts, _sum(counts)] if len(counts) > 1 else counts:
         numbers = map(str, (one.jobs, one.finished, one.trainings))
         hours = [one.hours, *([one.longest] if shards else ())]
