@@ -259,6 +259,7 @@ def evaluate(
             command=command,
             device=device,
             timing=extra.timing,
+            log=data.driving_log,
             ranks=ranks,
         )
     extra.measure(scene, data, options, out=out, command=command, say=say)
