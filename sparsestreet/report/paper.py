@@ -12,7 +12,7 @@ from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.run import FailedRun
 from sparsestreet.records.summary import HELD_OUT, TRAINING
 from sparsestreet.report.tables import ABSENT, THEIRS, Cell, Grid, without_empty
-from sparsestreet.report.variants import Variant, busy_variants
+from sparsestreet.report.variants import Variant, busy_variants, masks_note
 
 Key = tuple[str, str, str]
 """Views ("training", "held_out", "novel", ""), region and quantity of a column."""
@@ -281,7 +281,10 @@ def _notes(
         "n: runs; a number is the mean over scenes of the mean over each one's seeds; "
         "FPS is 1000 / median milliseconds of a frame",
     ]
-    if not any(record.summary.run.split == "none" for variant in variants for record in variant.records):
+    runs = [record.summary for variant in variants for record in variant.records]
+    if any(region in ("human", "vehicle") for _, region, _ in table.columns):
+        said += masks_note(runs)
+    if not any(run.run.split == "none" for run in runs):
         said.append(
             "reconstruction: of the training views of the runs that hold views out; no run trained on all views"
         )

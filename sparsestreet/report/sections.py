@@ -26,7 +26,7 @@ from sparsestreet.report.tables import (
     markdown_lines,
     spread,
 )
-from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
+from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, masks_note, repeats
 
 
 def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) -> list[str]:
@@ -34,6 +34,7 @@ def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) ->
     runs = [run for variant in variants for run in variant.runs]
     return [
         *_general(runs, over_scenes, protocol),
+        *masks_note(runs),
         *_absent(runs, protocol),
         *_timing(runs),
         *_training(runs),

@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -302,12 +303,16 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
         name="sky", on=True, source="measured", reason="r", value=1.0, unit="", threshold=None, noise=None, numbers=6,
         ms=0.1, gain=None,
     )  # fmt: skip
-    found = who.describe(Recipe(nodes={}, seed=6), data(), 17, (sky,))
+    street = data()
+    street.driving_log = replace(street.driving_log, masks={"human": "given", "ego": "shipped"})
+    found = who.describe(Recipe(nodes={}, seed=6), street, 17, (sky,))
     expected = {"label": "l", "method": "m", "sparsify": "s", "config": config, "data_hash": "h", "command": "c"}
     expected |= {"config_hash": config_hash(config), "scene": "street", "seed": 6, "split": "every 2th frame from 1"}
     expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
     expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2, "cameras": ("0 32x16",)}
     expected |= {"effects": (sky,), "rested": {}, "held_back": {}}
+    expected |= {"masks": {"sky": "none", "human": "given", "vehicle": "none"}}
+    assert who.describe(Recipe(nodes={}, seed=6), data(), 17, (sky,)).masks == {}  # a log that does not tell
     expected |= {"light": measured_light(data().split.train).numbers()}
     assert vars(found) == expected
 
