@@ -249,6 +249,8 @@ class ExtraMetrics:
     """Whether the shift grows over the drive, as in a change of lane."""
     presets: Sequence[str] = ()
     """Ways to render, names of ``render.preset``."""
+    training_lpips: bool = False
+    """Whether training views get LPIPS too where views are held out, which takes seconds an image on a CPU."""
     timing: Timing = field(default_factory=Timing)
     """How often the frames of the record are timed."""
 

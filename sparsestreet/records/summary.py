@@ -325,6 +325,19 @@ class RunSummary:
         found = self.quality.get(split or self.main_split, {}).get(metric)
         return None if found is None else found.mean
 
+    def mean_of_all(self, metric: str) -> float | None:
+        """Return the mean of a metric over training and held-out images together, each with its region counting once.
+
+        None without such images, and where some of them lack the metric, as LPIPS is mostly left out of training views.
+        """
+        region = next(region for region in REGIONS if metric.endswith(f"_{region}"))
+        parts = [(split.get(metric), split.get(metric_id("psnr", region))) for split in self.quality.values()]
+        found = [one for one, of_region in parts if one and of_region and one.images == of_region.images]
+        images = sum(one.images for one in found)
+        if len(found) < len(parts) or not images:
+            return None
+        return math.fsum(one.images * one.mean for one in found if one.mean is not None) / images
+
 
 SUMMARY = JsonFile("records/summary.json", RunSummary)
 

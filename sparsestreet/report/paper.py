@@ -15,7 +15,7 @@ from sparsestreet.report.tables import ABSENT, THEIRS, Cell, Grid, without_empty
 from sparsestreet.report.variants import Variant, busy_variants, masks_note
 
 Key = tuple[str, str, str]
-"""Views ("training", "held_out", "novel", ""), region and quantity of a column."""
+"""Views ("training", "held_out", "all", "novel", ""), region and quantity of a column."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class PublishedTable:
     number: int
     caption: str
     columns: tuple[Key, ...]
+    """Those as printed."""
     rows: tuple[PublishedRow, ...]
     views: str
     """What the paper says about the views of its numbers."""
@@ -45,6 +46,15 @@ class PublishedTable:
     def values(self, row: PublishedRow) -> Mapping[Key, float | None]:
         """Return column -> number."""
         return dict(zip(self.columns, row.values, strict=True))
+
+    @property
+    def shown(self) -> tuple[Key, ...]:
+        """The columns with ours: where the paper does not say of which views, those of all views follow."""
+        if self.views != _UNSAID:
+            return self.columns
+        held = [key for key in self.columns if key[0] == HELD_OUT]
+        rest = [key for key in self.columns if key[0] != HELD_OUT]
+        return (*held, *(("all", region, quantity) for _, region, quantity in held), *rest)
 
 
 _REGIONS = ("full", "human", "vehicle")
@@ -67,7 +77,7 @@ _ABLATION = (
     ("", "", "gaussians"),
 )
 _TWO = "reconstruction: of training views; novel views: every 10th frame"
-_UNSAID = "the paper does not say of which views; ours are the held-out ones"
+_UNSAID = "the paper does not say of which views; ours are of the held-out ones, and beside them of all"
 
 _SHIFTED = tuple(("novel", f"{meters} m", "fid") for meters in (1, 2, 3))
 
@@ -158,7 +168,7 @@ LAYOUT = _WAYMO
 """The layout of sweeps that reproduce no table of the paper."""
 
 
-_GROUPS = {TRAINING: "reconstruction", HELD_OUT: "novel views", "novel": "beside the path", "": ""}
+_GROUPS = {TRAINING: "reconstruction", HELD_OUT: "novel views", "all": "all views", "novel": "beside the path", "": ""}
 _TEXTS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "fid": "{:.2f}", "fps": "{:.1f}"}
 
 
@@ -175,16 +185,14 @@ def paper_table(
         if matching:
             rows += [_row(variant.title, variant, table, row, protocol) for variant in matching]
         elif sweep in TABLES:
-            rows.append(_row(f"{row.name} (not run)", None, table, row, protocol))
+            what = "published only" if row.method is None else "not run"
+            rows.append(_row(f"{row.name} ({what})", None, table, row, protocol))
     rows += [_row(variant.title, variant, table, None, protocol) for variant in left]
-    rows += [
-        _failed(folder, failure, len(rows[0]) if rows else 2 + 2 * len(table.columns)) for folder, failure in failures
-    ]
+    rows += [_failed(folder, failure, 2 + 2 * len(table.shown)) for folder, failure in failures]
     header = [("", "method"), ("", "n")]
-    for key in table.columns:
+    for key in table.shown:
         header += [(_GROUPS[key[0]], _heading(key)), (_GROUPS[key[0]], f"{_heading(key)}{THEIRS}")]
-    if sweep not in TABLES:
-        header, rows = without_empty(header, rows)
+    header, rows = without_empty(header, rows)
     beside = any(heading.endswith(THEIRS) for _, heading in header)
     of = f"Table {table.number} of the paper" if sweep in TABLES else "All arms, in the layout of the paper's Table 1"
     return Grid(
@@ -213,7 +221,7 @@ def _row(
     published = table.values(row) if row else {}
     runs = variant.run_names if variant else ()
     cells = [Cell(title, runs=runs), Cell(str(len(runs)) if variant else ABSENT, runs=runs)]
-    for key in table.columns:
+    for key in table.shown:
         ours = _ours(variant, key, protocol) if variant else None
         theirs = published.get(key)
         exact = "" if ours is None else f"{ours:.8g}"
@@ -229,7 +237,7 @@ def _ours(variant: Variant, key: Key, protocol: Protocol) -> float | None:
     held, whole = variant.mean(column), variant.mean(column, whole=True)
     if key[0] == TRAINING:  # as in DriveStudio, of the runs that were trained on all views where there are any
         return held if whole is None else whole
-    return whole if held is None and key[0] in ("", "novel") else held
+    return whole if held is None and key[0] in ("", "all", "novel") else held
 
 
 def _column(key: Key, protocol: Protocol) -> str | None:
@@ -284,7 +292,12 @@ def _notes(
     runs = [record.summary for variant in variants for record in variant.records]
     if any(region in ("human", "vehicle") for _, region, _ in table.columns):
         said += masks_note(runs)
-    if not any(run.run.split == "none" for run in runs):
+    if table.views == _UNSAID:
+        said.append(
+            "all views: the mean over the images of training and held-out views together, each image with the region "
+            "counting once; none where some of them lack the metric: for LPIPS say evaluate RUN training_lpips=true"
+        )
+    elif not any(run.run.split == "none" for run in runs):
         said.append(
             "reconstruction: of the training views of the runs that hold views out; no run trained on all views"
         )

@@ -37,7 +37,7 @@ def rows_of(grid):
 
 def test_published_figures_stand_beside_ours(found):
     rows = rows_of(paper_table(found, [], DRIVESTUDIO, "table1_waymo"))
-    assert list(rows)[:3] == ["EmerNeRF (not run)", "3DGS (not run)", "HUGS (not run)"]
+    assert list(rows)[:3] == ["EmerNeRF (published only)", "3DGS (not run)", "HUGS (published only)"]
     plain = rows["omnire-legacy"]
     assert plain["novel views full PSNR"].text == "29.00"
     assert (plain["novel views full PSNR, paper"].text, plain["novel views full PSNR, paper"].published) == (
@@ -126,6 +126,29 @@ def test_every_column_of_ours_is_its_own(protocol):
     assert len(theirs) == len(ours) - 2
 
 
+def test_all_views_count_every_image_once():
+    """20 dB on 2 held-out images and 26 on 6 training images: 24.5. One of them has a vehicle: 12 of 1 and 18 of 2.
+
+    LPIPS of held-out views alone is no number of all views.
+    """
+
+    def quality_of(**numbers):
+        return {name: MetricSummary(mean, None, images, 0) for name, (mean, images) in numbers.items()}
+
+    held = quality_of(psnr_full=(20.0, 2), psnr_vehicle=(12.0, 1), psnr_human=(None, 0), lpips_alex_full=(0.1, 2))
+    training = quality_of(psnr_full=(26.0, 6), psnr_vehicle=(18.0, 2), psnr_human=(17.0, 3), lpips_alex_full=(None, 0))
+    quality = {HELD_OUT: held, TRAINING: training}
+    summary = replace(make_summary("omnire+paper", training_psnr=1.0), quality=quality)
+    row = rows_of(paper_table(variants([record(summary)]), [], DRIVESTUDIO, "table5_ablation"))["omnire+paper"]
+    assert (row["novel views full PSNR"].text, row["all views full PSNR"].text) == ("20.00", "24.50")
+    assert (row["novel views vehicle PSNR"].text, row["all views vehicle PSNR"].text) == ("12.00", "16.00")
+    assert (row["novel views human PSNR"].text, row["all views human PSNR"].text) == ("-", "17.00")
+    assert (row["novel views full LPIPS"].text, row["all views full LPIPS"].text) == ("0.100", "-")
+    both = quality | {TRAINING: training | {"lpips_alex_full": MetricSummary(0.3, None, 6, 0)}}
+    assert replace(summary, quality=both).mean_of_all("lpips_alex_full") == pytest.approx(0.25)
+    assert replace(summary, quality={HELD_OUT: held, TRAINING: held}).mean_of_all("psnr_human") is None
+
+
 def test_a_scene_on_all_views_alone_has_counts_and_speed_but_no_novel_views():
     only = make_summary("omnire", psnr=None, training_psnr=30.0, milliseconds=8.0, gaussians={"a": 10}, split="none")
     row = rows_of(paper_table(variants([record(only)]), [], DRIVESTUDIO, "table1_waymo"))["omnire"]
@@ -144,13 +167,21 @@ def test_headers_and_notes_of_a_table():
     found = variants([record(make_summary("omnire")), record(make_summary("omnire+random"))])
     ablation = paper_table(found, [], DRIVESTUDIO, "table5_ablation")
     assert ablation.header[2:4] == (("novel views", "full PSNR"), ("novel views", "full PSNR, paper"))
+    regions = [f"full {one}" for one in ("PSNR", "SSIM", "LPIPS")] + ["human PSNR", "vehicle PSNR"]
+    assert ablation.header[12:17] == tuple(("all views", region) for region in regions)  # the paper has none
     assert ablation.header[-2:] == (("", "Gaussians (M)"), ("", "Gaussians (M), paper"))
     assert ablation.header[6] == ("novel views", "full LPIPS")
     assert ablation.title.startswith("Table 5 of the paper: ")
     assert ablation.notes[0].endswith("clock and machine, on its drives")
     assert ablation.notes[0].startswith("paper: published in Table 5, ")
     assert "control random: as many Gaussians, drawn at random" in ablation.notes
-    assert any(note.startswith("reconstruction: of the training views of the runs") for note in ablation.notes)
+    assert any(note.startswith("all views: the mean over the images of training and held") for note in ablation.notes)
+    table = paper_table(found, [], DRIVESTUDIO, None)
+    assert any(note.startswith("reconstruction: of the training views of the runs") for note in table.notes)
+    assert not any(note.startswith(("all views:", "masks of")) for note in table.notes)
+    fine = variants([record(make_summary("omnire", masks=dict.fromkeys(("human", "vehicle"), "fine")))])
+    assert "masks of people and vehicles: fine" in paper_table(fine, [], DRIVESTUDIO, None).notes
+    assert "masks of people and vehicles: fine" not in paper_table(fine, [], DRIVESTUDIO, "table4_novel").notes
     assert "failed runs are in no mean" not in ablation.notes
     assert f"protocol drivestudio: {', '.join(DRIVESTUDIO.metrics)}" in ablation.notes[2]
     whole = variants([record(make_summary("omnire", psnr=None, training_psnr=30.0, split="none"))])

@@ -48,6 +48,7 @@ class Options:
     novel: tuple[float, ...] | None = None
     ramp: bool | None = None
     presets: tuple[str, ...] | None = None
+    training_lpips: bool | None = None
     parts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -55,7 +56,7 @@ class Options:
 
     def extra(self, of_run: ExtraMetrics) -> ExtraMetrics:
         """What is asked for, else what the run's configuration asks for."""
-        asked = {name: getattr(self, name) for name in ("novel", "ramp", "presets")}
+        asked = {name: getattr(self, name) for name in ("novel", "ramp", "presets", "training_lpips")}
         return replace(of_run, **{name: value for name, value in asked.items() if value is not None})
 
 
@@ -100,7 +101,8 @@ def extra_words(extra: ExtraMetrics) -> list[str]:
     """What asks this command for these metrics."""
     novel = [f"novel={','.join(f'{offset:g}' for offset in extra.novel)}"] if extra.novel else []
     ramp = ["ramp=true"] if extra.ramp else []
-    return [*novel, *ramp, *([f"presets={','.join(extra.presets)}"] if extra.presets else [])]
+    presets = [f"presets={','.join(extra.presets)}"] if extra.presets else []
+    return [*novel, *ramp, *presets, *(["training_lpips=true"] if extra.training_lpips else [])]
 
 
 def _device(description: RunDescription, device: str | None) -> torch.device:
