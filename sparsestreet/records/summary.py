@@ -7,7 +7,7 @@ the former unchanged. Both are written whole or not at all.
 import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 
 from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, REGIONS, metric_id, quantities_of
 from sparsestreet.records.file import CsvFile, JsonFile
@@ -382,6 +382,8 @@ class NovelRecord:
     """Number of real images, those of the recorded views that are shifted."""
     absent: str | None
     """Why there are no distances, and what to do about it; None if there are some."""
+    missing: dict[str, str] = field(default_factory=dict)
+    """Distance that could not be measured, such as "fid" -> why, and what to do about it."""
     shifts: tuple[NovelShift, ...]
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.run import FailedRun
-from sparsestreet.records.summary import HELD_OUT, TRAINING
+from sparsestreet.records.summary import HELD_OUT, NOVEL, TRAINING, NovelRecord
 from sparsestreet.report.tables import ABSENT, THEIRS, Cell, Grid, without_empty
 from sparsestreet.report.variants import Variant, busy_variants, masks_note
 
@@ -290,8 +290,11 @@ def _notes(
         "FPS is 1000 / median milliseconds of a frame",
     ]
     runs = [record.summary for variant in variants for record in variant.records]
+    folders = [record.folder for variant in variants for record in variant.records]
     if any(region in ("human", "vehicle") for _, region, _ in table.columns):
         said += masks_note(runs)
+    if any(quantity == "fid" for _, _, quantity in table.columns):
+        said += _of_fid([found for run in folders if (found := NOVEL.find(run)) is not None])
     if table.views == _UNSAID:
         said.append(
             "all views: the mean over the images of training and held-out views together, each image with the region "
@@ -306,3 +309,16 @@ def _notes(
     if failed:
         said.append("failed runs are in no mean")
     return (*said, *busy_variants(variants))
+
+
+def _of_fid(records: Sequence[NovelRecord]) -> list[str]:
+    """Say of how many images FID is, and why some runs have none."""
+    measured = [record for record in records if any("fid" in shift.distances for shift in record.shifts)]
+    counts = sorted({record.real_views for record in measured})
+    number = " to ".join(dict.fromkeys(str(count) for count in (*counts[:1], *counts[-1:])))
+    said = [
+        f"FID: Frechet distance of Inception-v3's 2,048 features, of {number} recorded images a run and as many "
+        "renders a side; the fewer images, the more of it is bias: it compares rows of one sweep, not counts of images"
+    ]
+    reasons = sorted({record.missing["fid"] for record in records if "fid" in record.missing})
+    return [*(said if counts else []), *(f"FID n/a in some runs: {reason}" for reason in reasons)]

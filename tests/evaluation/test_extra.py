@@ -32,6 +32,7 @@ def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_
     monkeypatch, tmp_path, stride, views, ramp
 ):
     monkeypatch.setattr(extra, "open_lpips", lambda device: ({}, {"lpips_alex": "no weights"}))
+    monkeypatch.setattr(extra, "open_inception", lambda device: (None, {"fid": "no file"}))
     (tmp_path / "records").mkdir()
     said = []
     asked = ExtraMetrics(novel=(1.0,), ramp=ramp, presets=("fast",))
@@ -40,6 +41,10 @@ def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_
     assert (beside.real_views, beside.ramp) == (views, ramp)
     assert PRESETS.read(tmp_path).views == views
     assert f"1 m to the right (n={views}): nothing to compare with" in said
+    few = "distances need at least two images: hold out more views"
+    expected = {"fid": few, "alexnet": few} if views == 1 else {"fid": "no file", "alexnet": "no weights"}
+    alexnet = dict.fromkeys(("frechet_alexnet", "kernel_alexnet"), expected.pop("alexnet"))
+    assert beside.missing == expected | alexnet
 
 
 def test_what_is_said_of_a_side():
@@ -51,6 +56,8 @@ def test_what_is_said_of_a_side():
     record = NovelRecord(command="c", ramp=False, real_views=6, absent=None, shifts=tuple(shifts))
     said = [f"2 m to the {side} (n=6): fid 42, 20.00 dB to the truth" for side in ("right", "left")]
     assert list(_of_shifts(record)) == said
+    lacking = replace(record, missing={"fid": "no file", "kid": "no file", "frechet_alexnet": "no package"})
+    assert list(_of_shifts(lacking)) == [*said, "no fid, kid: no file", "no frechet_alexnet: no package"]
 
 
 NETWORK = object()
@@ -59,7 +66,8 @@ NETWORK = object()
 @pytest.mark.parametrize("weights", [{}, {"lpips_alex": NETWORK, "lpips_vgg": object()}])
 def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
     asked = {}
-    novel = NovelRecord(command="n", ramp=True, real_views=2, absent="no weights", shifts=())
+    reasons = {"fid": "no weights"}
+    novel = NovelRecord(command="n", ramp=True, real_views=2, absent="no weights", missing=reasons, shifts=())
     rendered = PresetRecord(command="p", device="d", threads=1, views=2, noise=NOISE, rendered=())
     for name, answer in (("evaluate_novel", novel), ("evaluate_presets", rendered)):
         monkeypatch.setattr(extra, name, lambda *args, n=name, a=answer, **how: asked.update({n: (args, how)}) or a)
@@ -68,6 +76,11 @@ def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
         extra, "open_lpips", lambda device: opened.append(device) or (weights, {"lpips_alex": "a", "lpips_vgg": "v"})
     )
     monkeypatch.setattr(extra, "LastLayer", lambda *given: ("features", *given))
+    inception = [object()] if weights else []
+    missing = {} if weights else {"fid": "i", "kid": "i"}
+    monkeypatch.setattr(
+        extra, "open_inception", lambda device: opened.append(device) or (*(inception or [None]), dict(missing))
+    )
     scene, data = small_scene(), street(truth=lambda view: None)
     truth = data.driving_log.truth
     told = ExtraMetrics(novel=(1.0, 2.5), ramp=True, presets=("fast", "fine"))
@@ -77,14 +90,15 @@ def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
     views = data.split.held_out
     assert asked["evaluate_novel"] == (
         (scene, views, (1.0, 2.5), OPTIONS),
-        {"command": "typed", "truth": truth, "absent": "a", "ramp": True,
-         "extractor": ("features", "alexnet", NETWORK) if weights else None, "lpips": NETWORK if weights else None},
+        {"command": "typed", "truth": truth, "ramp": True, "lpips": NETWORK if weights else None,
+         "extractors": [*inception, ("features", "alexnet", NETWORK)] if weights else [],
+         "missing": missing | ({} if weights else {"frechet_alexnet": "a", "kernel_alexnet": "a"})},
     )  # fmt: skip
     ways = {name: RenderOptions(SplatSettings.preset(name)) for name in ("fast", "fine")}
     assert asked["evaluate_presets"] == ((scene, views, ways, OPTIONS), {"command": "typed"})
-    assert opened == [scene.device]
+    assert opened == [scene.device] * 2
     assert (NOVEL.read(tmp_path), PRESETS.read(tmp_path)) == (novel, rendered)
-    assert said == ["no distances: no weights"]
+    assert said == ["no fid: no weights"]
     assert set(stages.seconds()) == {"other", "novel", "presets"}
 
 

@@ -7,10 +7,12 @@ import pytest
 
 from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.run import FailedRun
-from sparsestreet.records.summary import HELD_OUT, TRAINING, MetricSummary
+from sparsestreet.records.summary import HELD_OUT, NOVEL, TRAINING, MetricSummary
+from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.paper import TABLES, metric_id, paper_table
 from sparsestreet.report.variants import Variant, variants
 from tests.evaluation.frames import disturbed, make_summary
+from tests.records.novel import write_beside
 from tests.report.sweep_folder import record
 from tests.typed import there
 
@@ -192,6 +194,28 @@ def test_headers_and_notes_of_a_table():
     alone = paper_table([], [(Path("x"), failure)], DRIVESTUDIO, None)
     assert [len(row) for row in alone.rows] == [len(alone.header)]
     assert alone.rows[0][0].runs == ("x",)
+
+
+def test_fid_stands_in_table_4_or_says_why_not(tmp_path):
+    """The mean of both sides, for each of the rows; of how many images stands in the note, and what another lacks."""
+    for name, distances in (("a", {1.0: 40.0, -1.0: 44.0}), ("b", {2.0: 61.5, -2.0: 61.5})):
+        write_beside(tmp_path / name, distances)
+    few = NOVEL.read(tmp_path / "b")
+    NOVEL.write(tmp_path / "b", replace(few, real_views=3))
+    NOVEL.write(tmp_path / "c", replace(few, shifts=(), absent="no weights: get them", missing={"fid": "no weights"}))
+    labels = {"a": "omnire", "b": "omnire+paper", "c": "omnire+masks"}
+    found = variants([RunRecord(tmp_path / name, make_summary(label)) for name, label in labels.items()])
+    grid = paper_table(found, [], DRIVESTUDIO, "table4_novel")
+    rows = rows_of(grid)
+    beside = [rows["omnire"][f"beside the path {meters} m FID"].text for meters in (1, 2)]
+    assert beside == ["42.00", "-"]
+    assert rows["omnire"]["beside the path 2 m FID, paper"].text == "61.56"
+    assert rows["omnire+paper"]["beside the path 2 m FID"].text == "61.50"
+    (said,) = [note for note in grid.notes if note.startswith("FID: ")]
+    assert ", of 3 to 6 recorded images a run and as many renders a side; the fewer" in said
+    assert "FID n/a in some runs: no weights" in grid.notes
+    alone = paper_table([one for one in found if one.sparsify == "masks"], [], DRIVESTUDIO, "table4_novel")
+    assert [note for note in alone.notes if note.startswith("FID")] == ["FID n/a in some runs: no weights"]
 
 
 def test_words_of_a_rows_options_choose_its_arm():
