@@ -1,4 +1,4 @@
-"""What is measured of a finished scene where somebody asks: beside the recorded path, and rendered in other ways."""
+"""What is measured of a finished scene where somebody asks: beside the path, rendered in other ways, times alone."""
 
 import math
 import statistics
@@ -16,7 +16,7 @@ from sparsestreet.data.frame_cache import to_device
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Truth
 from sparsestreet.evaluation.evaluate import frame_quality, quantized, restored, screen_image
-from sparsestreet.evaluation.speed import Timing, device_name, frame_image
+from sparsestreet.evaluation.speed import Timing, device_name, frame_image, measure_latency, measure_scene_costs
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.metrics.definitions import metric_id
 from sparsestreet.metrics.distances import Extractor, LastLayer, distance_names
@@ -28,14 +28,22 @@ from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.settings import OWN_PRESETS
 from sparsestreet.phases import clock_of, stage
+from sparsestreet.records.costs import COSTS, update_costs
+from sparsestreet.records.file import check_links
+from sparsestreet.records.run import this_machine, this_source
 from sparsestreet.records.summary import (
+    LATENCY,
     NOVEL,
     PRESETS,
+    SUMMARY,
+    Evaluation,
     FrameQuality,
     NovelRecord,
     NovelShift,
     PresetRecord,
     RenderedAs,
+    RunSummary,
+    clock_rows,
     summarize,
 )
 from sparsestreet.scene.graph import SceneGraph
@@ -340,3 +348,31 @@ def _of_presets(record: PresetRecord) -> Iterator[str]:
             f"{one.preset}{' (as trained)' if one.trained else ''}: {one.quality['psnr_full']:.2f} dB, "
             f"{one.psnr_to_exact:.1f} dB to the exact image, {one.frame_ms:.1f} ms/frame"
         )
+
+
+def time_again(
+    run: Path, scene: SceneGraph, views: Sequence[View], options: RenderOptions, timing: Timing, *, command: str
+) -> RunSummary:
+    """Time the frames of a run that was measured, and renew what its records say of times; all else stays.
+
+    Args:
+        run: its folder.
+        scene: on the device where it is timed.
+        views: those of its main split.
+        options: how it is rendered.
+        timing: how often.
+        command: that asked for it.
+
+    Raises RecordError for a run without a summary, OSError for a link that leads out of its folder.
+    """
+    summary, scene = SUMMARY.read(run), StandingScene.of(scene.eval())
+    check_links(run)
+    latency = measure_latency(scene, views, options, warmup=timing.warmup, repeats=timing.repeats)
+    costs = measure_scene_costs(scene, views, options, repeats=timing.rounds)
+    LATENCY.write(run, clock_rows(latency))
+    if COSTS.exists(run):
+        update_costs(run, **vars(costs))
+    timed = Evaluation(command, this_machine(), this_source(), latency.device, latency.threads)
+    renewed = replace(summary, latency=latency, latency_protocol=latency.protocol, timed=timed)
+    SUMMARY.write(run, renewed)  # the last: it says that the others are renewed
+    return renewed

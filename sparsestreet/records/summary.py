@@ -278,6 +278,8 @@ class RunSummary:
     format: int = version(FORMAT, "evaluate again")
     run: RunDescription
     evaluated: Evaluation
+    timed: Evaluation | None = None
+    """The command, machine and code of ``latency``, where the frames were timed once more; None: those above."""
     images: dict[str, int]
     """Split ("held_out", "training") -> number of its evaluated images; a split without views is absent."""
     resolutions: tuple[str, ...]
@@ -319,6 +321,11 @@ class RunSummary:
     def main_split(self) -> str:
         """The held-out split, or the training split of a run that holds out no views."""
         return HELD_OUT if HELD_OUT in self.quality else TRAINING
+
+    @property
+    def timing(self) -> Evaluation:
+        """The command, machine and code that timed the frames."""
+        return self.timed or self.evaluated
 
     def mean(self, metric: str, split: str | None = None) -> float | None:
         """Return the mean of a metric over the images of a split (default ``main_split``); None if not measured."""

@@ -291,6 +291,9 @@ def _notes(
     ]
     runs = [record.summary for variant in variants for record in variant.records]
     folders = [record.folder for variant in variants for record in variant.records]
+    alone = sum(run.timed is not None for run in runs)
+    if alone and any(quantity == "fps" for _, _, quantity in table.columns):
+        said.append(f"FPS: {alone} of {len(runs)} runs timed alone, one after the other (evaluate DIR only=speed)")
     if any(region in ("human", "vehicle") for _, region, _ in table.columns):
         said += masks_note(runs)
     if any(quantity == "fid" for _, _, quantity in table.columns):

@@ -94,11 +94,11 @@ def _lidar(runs: Sequence[RunSummary]) -> list[str]:
 
 def _timing(runs: Sequence[RunSummary]) -> list[str]:
     """Say where and with what ms/frame was measured."""
-    places = [(run.latency.device, run.latency.threads, run.evaluated.machine) for run in runs]
+    places = [(run.latency.device, run.latency.threads, run.timing.machine) for run in runs]
     said = _places("ms/frame", "measured", places)
     if len({run.latency.protocol for run in runs}) > 1:
         said.append("ms/frame were taken with different numbers of renders; see each summary.json")
-    return said + _commits("measured", [run.evaluated.source for run in runs])
+    return said + _commits("measured", [run.timing.source for run in runs])
 
 
 def _training(runs: Sequence[RunSummary]) -> list[str]:

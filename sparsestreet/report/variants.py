@@ -367,7 +367,7 @@ def why_apart(found: Sequence[Variant]) -> list[str]:
 
 
 def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
-    made, measured = run.run, run.evaluated
+    made, measured = run.run, run.timing
     device = made.device if made.device == measured.device else f"{made.device}, measured on {measured.device}"
     threads = f"{made.threads} thread{'s' if made.threads != 1 else ''}"
     threads += f", measured with {measured.threads}" if made.threads != measured.threads else ""

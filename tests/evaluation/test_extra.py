@@ -10,12 +10,25 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation import extra
-from sparsestreet.evaluation.extra import ExtraMetrics, _of_presets, _of_shifts
+from sparsestreet.evaluation.extra import ExtraMetrics, _of_presets, _of_shifts, time_again
+from sparsestreet.evaluation.speed import Timing
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import StageRecorder
-from sparsestreet.records.summary import NOVEL, PRESETS, NovelRecord, NovelShift, PresetRecord, RenderedAs
+from sparsestreet.records.costs import COSTS, EffectGain, update_costs
+from sparsestreet.records.run import this_machine, this_source
+from sparsestreet.records.summary import (
+    LATENCY,
+    NOVEL,
+    PRESETS,
+    SUMMARY,
+    Evaluation,
+    NovelRecord,
+    NovelShift,
+    PresetRecord,
+    RenderedAs,
+)
 from sparsestreet.scene.rendering import RenderOptions
-from tests.evaluation.frames import NOISE, make_frame
+from tests.evaluation.frames import NOISE, make_frame, make_summary
 from tests.evaluation.scenes import OPTIONS, small_scene
 
 
@@ -144,3 +157,30 @@ def test_metrics_that_cannot_be_are_refused():
     for asked, said in cases:
         with pytest.raises(ValueError, match=said):
             ExtraMetrics(**asked)
+
+
+def test_times_are_renewed_and_nothing_else(tmp_path):
+    """Of a run with costs; one without gets none, as a record of costs says that a run is whole."""
+    before = make_summary(milliseconds=4e5, training_psnr=20.0)
+    gain = EffectGain(1.0, None, None, 3)
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    for run in (whole, part):
+        SUMMARY.write(run, before)
+    update_costs(whole, phases={"train": 9.0}, frame_ms={"splat": 4e5}, gains={"affine": gain})
+    views = street().split.held_out.views
+    for run in (whole, part):
+        time_again(run, small_scene(), views, OPTIONS, Timing(1, 3, 2), command="typed")
+        after = SUMMARY.read(run)
+        assert replace(after, latency=before.latency, latency_protocol=before.latency_protocol, timed=None) == before
+        assert after.latency.p50 < 4e5
+        assert (after.latency.clocks["frame"].repeats, after.latency.warmup, after.latency.views) == (3, 1, 2)
+        assert after.latency_protocol == after.latency.protocol
+        by = Evaluation("typed", this_machine(), this_source(), after.latency.device, after.latency.threads)
+        assert after.timed == after.timing == by
+        assert {row.clock: row.percentiles.repeats for row in LATENCY.read(run)} == {"frame": 3, "rig": 3, "raster": 3}
+    costs = COSTS.read(whole)
+    assert (costs.phases, costs.gains) == ({"train": 9.0}, {"affine": gain})
+    assert sum(costs.frame_ms.values()) < 4e5
+    assert costs.noise is not None
+    assert not COSTS.exists(part)
+    assert before.timing == before.evaluated

@@ -7,11 +7,13 @@ import pytest
 
 from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.run import FailedRun
-from sparsestreet.records.summary import HELD_OUT, NOVEL, TRAINING, MetricSummary
+from sparsestreet.records.summary import HELD_OUT, NOVEL, SUMMARY, TRAINING, Evaluation, MetricSummary
+from sparsestreet.report.bundle import _lay
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.paper import TABLES, metric_id, paper_table
+from sparsestreet.report.sections import sections
 from sparsestreet.report.variants import Variant, variants
-from tests.evaluation.frames import disturbed, make_summary
+from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary
 from tests.records.novel import write_beside
 from tests.report.sweep_folder import record
 from tests.typed import there
@@ -242,6 +244,22 @@ def test_frames_of_a_busy_machine_carry_the_mark_where_they_stand():
         "omnire+mine": "62.5 §",
     }
     assert grid.notes[-1].endswith("compared with no other: frames of omnire+mine")
+
+
+def test_frames_that_were_timed_alone_are_said(tmp_path):
+    """Their machine is the one that timed them; a bundle names no folder of it."""
+    command = "sparsestreet evaluate run=/home/me/a only=speed"
+    alone = Evaluation(command, replace(MACHINE, cores=64), CLEAN, "cuda: x", 2)
+    runs = [make_summary("omnire"), replace(make_summary("omnire", 1), timed=alone)]
+    found = variants([record(one) for one in runs])
+    assert [variant.name for variant in found] == ["omnire (cpu: test)", "omnire (cpu: test, measured on cuda: x)"]
+    grid = paper_table(found, [], DRIVESTUDIO, None)
+    assert "FPS: 1 of 2 runs timed alone, one after the other (evaluate DIR only=speed)" in grid.notes
+    assert not any("alone" in note for note in paper_table(found, [], DRIVESTUDIO, "table5_ablation").notes)
+    (section,) = sections([record(one) for one in runs])
+    assert any("ms/frame are not comparable" in note and "64 cores" in note for note in section.notes)
+    _lay(RunRecord(tmp_path / "run", runs[1]), tmp_path / "laid")
+    assert there(SUMMARY.read(tmp_path / "laid").timed).command == "sparsestreet evaluate run=a only=speed"
 
 
 def test_columns_of_the_paper_without_a_number_are_left_out():
