@@ -5,6 +5,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+FOUND = "found_"
+"""Begins the names of objects that nobody annotated: lidar showed that they move."""
 LONGEST = 100
 """Letters of a name that are compared: difflib takes seconds for a name of megabytes."""
 

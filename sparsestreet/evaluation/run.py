@@ -10,7 +10,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames, as_frames, spread
+from sparsestreet.data.log import DrivingLog, Split
 from sparsestreet.evaluation.evaluate import Predictions, evaluate_frames, lidar_masks, screen_image
+from sparsestreet.evaluation.geometry import measure_geometry
 from sparsestreet.evaluation.speed import Timing, measure_latency, measure_scene_costs, to_uint8
 from sparsestreet.metrics.definitions import DEFINITIONS
 from sparsestreet.metrics.lpips import open_lpips
@@ -20,6 +22,7 @@ from sparsestreet.pictures.images import KINDS, Picture, draw_lidar_end, error_p
 from sparsestreet.pictures.sheets import Legend, picture_sheet
 from sparsestreet.ranks import ALONE, Ranks
 from sparsestreet.records.costs import EffectGain, update_costs
+from sparsestreet.records.geometry import Geometry
 from sparsestreet.records.run import RunDescription, this_machine, this_source
 from sparsestreet.records.summary import (
     HELD_OUT,
@@ -93,6 +96,7 @@ def evaluate_scene(
     pictures: int = 4,
     timing: Timing | None = None,
     training_lpips: bool = False,
+    log: DrivingLog | None = None,
     ranks: Ranks = ALONE,
 ) -> RunSummary:
     """Measure quality, speed and size of a scene; write ``out/records``, ``out/predictions`` and ``out/pictures``.
@@ -114,6 +118,7 @@ def evaluate_scene(
         pictures: how many views become pictures.
         timing: how often frames are timed; None: ``Timing()``.
         training_lpips: as in ``ExtraMetrics``.
+        log: whose sweeps are compared with ranges of the scene; None: nothing is.
         ranks: the processes that measure quality together. This is the first; the others call ``help_to_evaluate``.
 
     Raises ValueError without any view, or for renders that are not finite, LostProcessError.
@@ -133,7 +138,14 @@ def evaluate_scene(
         latency = measure_latency(scene, frames.views, options, warmup=timing.warmup, repeats=timing.repeats)
     with stage("costs"):
         costs = measure_scene_costs(scene, frames.views, options, repeats=timing.rounds)
-    summary = _summary(scene, quality, latency, _guard_counts(scene, frames.views, options), run, command, absent)
+    with stage("geometry"):
+        held_out_indices = Split(as_frames(training), as_frames(held_out)).held_out_indices
+        geometry = None if log is None else measure_geometry(scene, log, held_out_indices, options)
+    if log is not None and log.sweeps and geometry is None:
+        absent = {**absent, "geometry": "no sweep tells where its lidar stood: read the log by a reader that knows"}
+    summary = _summary(
+        scene, quality, latency, _guard_counts(scene, frames.views, options), run, command, absent, geometry
+    )
     with stage("pictures"):
         chosen = [_picture(scene, frames[index], options) for index in choose_pictures(quality[main], pictures)]
         _write_pictures(chosen, summary, node_legend(scene.counts()), out / "pictures")
@@ -215,6 +227,7 @@ def _summary(
     run: RunDescription,
     command: str,
     absent: Mapping[str, str],
+    geometry: Geometry | None,
 ) -> RunSummary:
     gaussians, bytes_by_part = scene.counts(), scene.bytes_by_part()
     sizes = {f"{image.width}x{image.height}" for images in quality.values() for image in images}
@@ -234,6 +247,7 @@ def _summary(
         latency=latency,
         latency_protocol=latency.protocol,
         guards=guard_counts,
+        geometry=geometry,
     )
 
 

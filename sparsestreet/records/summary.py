@@ -11,6 +11,7 @@ from dataclasses import astuple, dataclass, field
 
 from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, REGIONS, metric_id, quantities_of
 from sparsestreet.records.file import CsvFile, JsonFile
+from sparsestreet.records.geometry import Geometry
 from sparsestreet.records.run import CodeVersion, Machine, Noise, RunDescription
 from sparsestreet.records.strict_json import significant, version
 
@@ -302,6 +303,9 @@ class RunSummary:
     latency_protocol: str
     guards: GuardCounts
     """Counts over the views of ``main_split``."""
+    geometry: Geometry | None = None
+    """Errors of ranges along lidar rays; None without lidar, of one that is not told where it stood, and in records of
+    earlier versions."""
 
     def __post_init__(self) -> None:
         splits = [sorted(part) for part in (self.quality, self.by_camera, self.images)]

@@ -10,9 +10,10 @@ import pandas as pd
 
 from sparsestreet.records.configuration import config_hash, only
 from sparsestreet.records.costs import COSTS, PRUNE, CostRecord
+from sparsestreet.records.geometry import SEEN
 from sparsestreet.records.strict_json import json_line, write_atomically
 from sparsestreet.records.summary import NOVEL, SUMMARY, RunSummary
-from sparsestreet.report.tables import CLOCKS
+from sparsestreet.report.tables import CLOCKS, GEOMETRY
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ def _kept(summary: RunSummary) -> dict[str, object]:
         "sizes": summary.resolutions,
         "images": summary.images,
         "quality": means,
+        **({} if summary.geometry is None else {"geometry": summary.geometry.groups}),
         "gaussians": summary.gaussians,
         "gaussians_total": summary.gaussians_total,
         "caps": run.caps,
@@ -151,6 +153,9 @@ def _numbers(summary: RunSummary) -> Iterator[tuple[str, object]]:
     for split, metrics in summary.quality.items():
         yield from ((f"{split} {name}", one.mean) for name, one in metrics.items())
     yield from ((f"all {name}", summary.mean_of_all(name)) for name in summary.quality[summary.main_split])
+    if summary.geometry is not None and (seen := summary.geometry.groups.get(SEEN)) is not None:
+        percent = None if seen.within is None else 100 * seen.within
+        yield from zip((one.column for one in GEOMETRY), (seen.median, percent), strict=True)
     for camera, means in summary.by_camera[summary.main_split].items():
         yield from ((f"camera {camera} {name}", mean) for name, mean in means.items())
 

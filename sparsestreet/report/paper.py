@@ -11,7 +11,7 @@ from pathlib import Path
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.run import FailedRun
 from sparsestreet.records.summary import HELD_OUT, NOVEL, TRAINING, NovelRecord
-from sparsestreet.report.tables import ABSENT, THEIRS, Cell, Grid, without_empty
+from sparsestreet.report.tables import ABSENT, GEOMETRY, THEIRS, Cell, Grid, Quantity, number_cell, without_empty
 from sparsestreet.report.variants import Variant, busy_variants, masks_note
 
 Key = tuple[str, str, str]
@@ -177,21 +177,24 @@ def paper_table(
 ) -> Grid:
     """Return the paper's table that a sweep reproduces; for any other sweep, its variants in the layout of Table 1."""
     table = TABLES.get(sweep or "", LAYOUT)
+    lidar = [one for one in GEOMETRY if any(variant.mean(one.column) is not None for variant in variants)]
     left = list(variants)
     rows = []
     for row in table.rows:
         matching = [variant for variant in left if _stands_beside(variant, row)]
         left = [variant for variant in left if variant not in matching]
         if matching:
-            rows += [_row(variant.title, variant, table, row, protocol) for variant in matching]
+            rows += [_row(variant.title, variant, table, row, protocol, lidar) for variant in matching]
         elif sweep in TABLES:
             what = "published only" if row.method is None else "not run"
-            rows.append(_row(f"{row.name} ({what})", None, table, row, protocol))
-    rows += [_row(variant.title, variant, table, None, protocol) for variant in left]
-    rows += [_failed(folder, failure, 2 + 2 * len(table.shown)) for folder, failure in failures]
+            rows.append(_row(f"{row.name} ({what})", None, table, row, protocol, lidar))
+    rows += [_row(variant.title, variant, table, None, protocol, lidar) for variant in left]
+    width = 2 + 2 * len(table.shown) + len(lidar)
+    rows += [_failed(folder, failure, width) for folder, failure in failures]
     header = [("", "method"), ("", "n")]
     for key in table.shown:
         header += [(_GROUPS[key[0]], _heading(key)), (_GROUPS[key[0]], f"{_heading(key)}{THEIRS}")]
+    header += [("lidar", one.heading) for one in lidar]
     header, rows = without_empty(header, rows)
     beside = any(heading.endswith(THEIRS) for _, heading in header)
     of = f"Table {table.number} of the paper" if sweep in TABLES else "All arms, in the layout of the paper's Table 1"
@@ -216,7 +219,12 @@ def _heading(key: Key) -> str:
 
 
 def _row(
-    title: str, variant: Variant | None, table: PublishedTable, row: PublishedRow | None, protocol: Protocol
+    title: str,
+    variant: Variant | None,
+    table: PublishedTable,
+    row: PublishedRow | None,
+    protocol: Protocol,
+    lidar: Sequence[Quantity],
 ) -> tuple[Cell, ...]:
     published = table.values(row) if row else {}
     runs = variant.run_names if variant else ()
@@ -227,6 +235,7 @@ def _row(
         exact = "" if ours is None else f"{ours:.8g}"
         busy = f" {variant.busy('frames')}".rstrip() if variant and key[2] == "fps" else ""
         cells += [Cell(_text(ours, key) + busy, runs=runs, exact=exact), Cell(_text(theirs, key), published=True)]
+    cells += [number_cell(variant.mean(one.column) if variant else None, one.text, runs) for one in lidar]
     return tuple(cells)
 
 

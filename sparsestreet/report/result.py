@@ -5,6 +5,7 @@ from pathlib import Path
 from sparsestreet.metrics.definitions import DRIVESTUDIO, Protocol
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.curves import HELD_OUT_CURVE
+from sparsestreet.records.geometry import SEEN, VEHICLES, WITHIN, Geometry
 from sparsestreet.records.run import RunDescription
 from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
 from sparsestreet.report.tables import frames_steady, training_steady
@@ -30,6 +31,7 @@ def result_lines(summary: RunSummary, out: Path, protocol: Protocol = DRIVESTUDI
     size = [f"{summary.gaussians_total:,} Gaussians", f"{summary.bytes_total / 1e6:.2f} MB", *trained]
     return [
         *(_quality(summary, split, protocol) for split in (HELD_OUT, TRAINING) if split in summary.quality),
+        *_ranges(summary.geometry),
         ", ".join([*size, f"{latency.p50:.1f} ms a frame{steady}"]),
         *_effects(run, out),
         *_warnings(run),
@@ -73,6 +75,20 @@ def _better_before(out: Path) -> list[str]:
             (best, step), (last, _) = max(seen), seen[-1]
             said.append(f"{name} {best:.2f} dB at step {step:,}, {last:.2f} dB at the end")
     return [f"held-out views were better before (curves/held_out.png): {'; '.join(said)}"] if said else []
+
+
+def _ranges(geometry: Geometry | None) -> list[str]:
+    """Errors along the lidar rays whose returns cameras see, and along those of vehicles."""
+    groups = {} if geometry is None else geometry.groups
+    said = [
+        f"{name} {one.median:.3f} m ({100 * one.within:.0f} % within {WITHIN:g} m)"
+        for name, one in (("in images", groups.get(SEEN)), ("on vehicles", groups.get(VEHICLES)))
+        if one is not None and one.median is not None and one.within is not None
+    ]
+    if geometry is None or not said:
+        return []
+    sweeps = f"{len(geometry.sweeps)} {geometry.split.replace('_', '-')} sweeps"
+    return [f"ranges along the rays of {sweeps}: median error {', '.join(said)}"]
 
 
 def _quality(summary: RunSummary, split: str, protocol: Protocol) -> str:

@@ -19,6 +19,7 @@ from sparsestreet.report.tables import (
     ABSENT,
     BUSY,
     CAPPED,
+    GEOMETRY,
     LEFT_OUT,
     Quantity,
     Spread,
@@ -62,6 +63,7 @@ def _general(runs: Sequence[RunSummary], over_scenes: bool, protocol: Protocol) 
         f"{', '.join((*protocol.vehicle, *protocol.human))} (images without the mask skipped); definitions in each "
         "summary.json",
         *_lidar(runs),
+        *_ranges(runs),
         f"MB: 10^6 bytes of parameters; ms/frame: median, {runs[0].latency.protocol}",
     ]
 
@@ -89,6 +91,17 @@ def _lidar(runs: Sequence[RunSummary]) -> list[str]:
     return [
         f"near: psnr_near_lidar, of pixels with a lidar return within {100 * LIDAR_REACH:g} % of the longer image "
         "side; beyond: psnr_beyond_lidar, of the others; sky left out"
+    ]
+
+
+def _ranges(runs: Sequence[RunSummary]) -> list[str]:
+    """Say which rays the errors of ranges are of, if a run has any."""
+    splits = sorted({run.geometry.split.replace("_", "-") for run in runs if run.geometry is not None})
+    if not splits:
+        return []
+    return [
+        f"median range error: along the rays of {' or '.join(splits)} sweeps whose returns lie in an image of their "
+        "instant, of those that meet anything; the share within is of all of them"
     ]
 
 
@@ -250,6 +263,7 @@ def quantities(runs: Sequence[RunSummary], protocol: Protocol = DRIVESTUDIO) -> 
     counts = {"Gaussians": "Gaussians"} | {name: f"Gaussians of {name}" for name in nodes}
     known = (
         *(Quantity(heading, f"{HELD_OUT} {name}", text) for heading, name, text in metrics),
+        *GEOMETRY,
         *(Quantity(f"train-view {heading}", f"{TRAINING} {name}", text) for heading, name, text in of_training),
         *(Quantity(name, column, "{:,.0f}", relative=True, count=True) for name, column in counts.items()),
         *_TIMES,

@@ -9,6 +9,7 @@ from itertools import compress, groupby
 from scipy.special import stdtrit
 
 from sparsestreet.records.file import csv_text
+from sparsestreet.records.geometry import WITHIN
 from sparsestreet.records.summary import RunSummary
 
 ABSENT = "-"
@@ -167,6 +168,13 @@ class Quantity:
     """Whether it counts Gaussians, which a cap can limit."""
     clock: str = ""
     """What is timed, a key of ``CLOCKS``: a time of a machine that was not quiet compares with none. Empty: no time."""
+
+
+GEOMETRY = (
+    Quantity("median range error, m", "median range error", "{:.3f}"),
+    Quantity(f"within {WITHIN:g} m, %", "ranges within", "{:.1f}"),
+)
+"""Columns of the ranges along lidar rays that a camera sees too (docs/metrics.md); runs without lidar have neither."""
 
 
 CONFIDENCE = 0.95

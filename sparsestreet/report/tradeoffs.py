@@ -1,7 +1,7 @@
 """The cost of getting smaller: paired differences, and the best variant of a sweep at one quality or one size."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import attrgetter
 
 import pandas as pd
@@ -9,7 +9,18 @@ import pandas as pd
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.summary import HELD_OUT
 from sparsestreet.report.collect import by_scene, mean_over_scenes
-from sparsestreet.report.tables import CAPPED, CONFIDENCE, LEFT_OUT, Cell, Grid, Quantity, Spread, number_cell, spread
+from sparsestreet.report.tables import (
+    CAPPED,
+    CONFIDENCE,
+    GEOMETRY,
+    LEFT_OUT,
+    Cell,
+    Grid,
+    Quantity,
+    Spread,
+    number_cell,
+    spread,
+)
 from sparsestreet.report.variants import Variant, busy_variants, masks_note, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
@@ -29,6 +40,7 @@ def measures(protocol: Protocol) -> tuple[Quantity, ...]:
     )
     return (
         *(Quantity(heading, f"{HELD_OUT} {metric}", text) for heading, metric, text in quality),
+        *(replace(one, text=one.text.replace("{:", "{:+")) for one in GEOMETRY),
         Quantity("Gaussians", "Gaussians", "{:+.1f}", relative=True),
         Quantity("MB", "MB", "{:+.1f}", relative=True),
         Quantity("ms/frame", "ms/frame", "{:+.1f}", relative=True, clock="frames"),

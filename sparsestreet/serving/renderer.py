@@ -4,6 +4,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from jaxtyping import UInt8
 from sparsestreet.records.run import RUN
 from sparsestreet.scene.edits import Change, Edits, Given, edited, objects_of
 from sparsestreet.scene.edits.edits import found
+from sparsestreet.scene.edits.ground import Ground
 from sparsestreet.scene.effects.optics import GlobalShutter, Pinhole
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.rendering import render
@@ -40,6 +42,11 @@ class ServedScene:
     name: str
     stored: StoredScene
     rig: Rig
+
+    @cached_property
+    def ground(self) -> Ground:
+        """Its ground, read when somebody asks for the first time."""
+        return Ground(self.stored.scene)
 
 
 @dataclass(frozen=True)

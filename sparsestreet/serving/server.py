@@ -5,12 +5,11 @@ the threads of other requests encode. No request ends the server.
 """
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any, NoReturn
+from typing import Any
 
 import grpc
 
@@ -20,6 +19,7 @@ from sparsestreet.listening import address, check_address
 from sparsestreet.records.run import this_source
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import NotServedError, Turns, camera_spec, pose_message
+from sparsestreet.serving.remarks import Remarks
 from sparsestreet.serving.renderer import (
     Picture,
     Scenes,
@@ -30,7 +30,7 @@ from sparsestreet.serving.renderer import (
     picture,
     view_of,
 )
-from sparsestreet.types import View
+from sparsestreet.serving.standard import handler, only_message, refuse, standard_handlers
 
 log = logging.getLogger(__name__)
 
@@ -38,14 +38,8 @@ MAX_MESSAGE = 64 * 2**20
 """Bytes: that of AlpaSim's channel to its renderer."""
 MAX_WAITING = 256
 """Requests at the same time; further ones get RESOURCE_EXHAUSTED."""
-WHOLE_MESSAGE = 60.0
-"""Seconds within which the message of a call must have come; a call without one holds a place of all."""
 _MAX_CAMERAS = 64
 """Of a batch."""
-_ELSEWHERE = 2.0
-"""Meters from all recorded cameras; farther away, pictures hold what none of them saw."""
-_LONGEST_DETAILS = 1000
-"""Characters: gRPC refuses statuses of some kilobytes, and names in requests may be long."""
 _CODES = {
     UnknownSceneError: grpc.StatusCode.NOT_FOUND,
     NotServedError: grpc.StatusCode.UNIMPLEMENTED,
@@ -67,7 +61,7 @@ class Sensorsim:
         """``encoders``: threads that encode the pictures of batches."""
         self.scenes = scenes
         self._device = Turns()
-        self._guessed: set[str] = set()
+        self._remarks = Remarks()
         self._encoders = ThreadPoolExecutor(encoders, "encode")
 
     def render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
@@ -153,24 +147,15 @@ class Sensorsim:
     def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, dict[str, float]]:
         """Return the picture and what it took, milliseconds, as the answer's trailing metadata call it."""
         served: ServedScene = self.scenes.get(request.scene_id)
+        self._remarks.on_names(served, request)
         view, edits = view_of(request, served.rig), edits_of(request, served)
-        self._note_guess(served, view)
+        self._remarks.on_camera(served, view)
+        self._remarks.on_heights(served, view, edits)
         asked = time.perf_counter()
         with self._device.turn(partial(_check_wanted, context)):
             started = time.perf_counter()
             image = picture(served, view, edits)
         return image, {"wait-ms": 1000 * (started - asked), "render-ms": 1000 * (time.perf_counter() - started)}
-
-    def _note_guess(self, served: ServedScene, view: View) -> None:
-        """One line of the log for each scene, at the first picture from where no camera was."""
-        meters = served.rig.distance(view)
-        if meters > _ELSEWHERE and served.name not in self._guessed:
-            self._guessed.add(served.name)
-            log.warning(
-                "%s: a camera is %.1f m from where the log's were at that time; what none of them saw is a guess",
-                served.name,
-                meters,
-            )
 
 
 def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Server, int]:
@@ -193,11 +178,7 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
         options=[*size, ("grpc.so_reuseport", 0)],
         maximum_concurrent_rpcs=MAX_WAITING,
     )
-    calls = {name: _handler(getattr(service, name), *kinds) for name, kinds in wire.METHODS.items()}
-    handlers = [grpc.method_handlers_generic_handler(name, calls) for name in wire.SERVICES]
-    health = _handler(_health, "grpc.health.v1.HealthCheckRequest", "grpc.health.v1.HealthCheckResponse")
-    handlers.append(grpc.method_handlers_generic_handler("grpc.health.v1.Health", {"Check": health}))
-    server.add_generic_rpc_handlers(tuple(handlers))
+    server.add_generic_rpc_handlers((*_handlers(service), *standard_handlers()))
     try:
         bound = server.add_insecure_port(address(host, port))
     except RuntimeError as error:
@@ -206,35 +187,19 @@ def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Serv
     return server, bound
 
 
-def _health(request: Any, context: grpc.ServicerContext) -> Any:
-    if request.service not in ("", *wire.SERVICES):
-        raise UnknownSceneError(f"there is no service {request.service!r}")
-    return wire.kind("grpc.health.v1.HealthCheckResponse")(status=1)
-
-
 Call = Callable[[Any, grpc.ServicerContext], Any]
 
 
-def _handler(call: Call, request: str, answer: str) -> grpc.RpcMethodHandler:
-    # One message a call, as a stream of one: so the wait for it has an end.
-    return grpc.stream_unary_rpc_method_handler(
-        partial(_awaited, call),
-        request_deserializer=wire.kind(request).FromString,
-        response_serializer=wire.kind(answer).SerializeToString,
-    )
+def _handlers(service: Sensorsim) -> list[grpc.GenericRpcHandler]:
+    calls = {
+        name: handler(grpc.stream_unary_rpc_method_handler, partial(_awaited, getattr(service, name)), *kinds)
+        for name, kinds in wire.METHODS.items()
+    }
+    return [grpc.method_handlers_generic_handler(name, calls) for name in wire.SERVICES]
 
 
 def _awaited(call: Call, requests: Iterator[Any], context: grpc.ServicerContext) -> Any:
-    """The answer to the one message of a call, which ends where its sender keeps all waiting."""
-    late = threading.Timer(WHOLE_MESSAGE, context.cancel)
-    late.start()
-    try:
-        request = next(requests)
-    except StopIteration:
-        _refuse(context, grpc.StatusCode.INVALID_ARGUMENT, "the call has no message: send one")
-    finally:
-        late.cancel()
-    return _answered(call, request, context)
+    return _answered(call, only_message(requests, context), context)
 
 
 def _answered(call: Call, request: Any, context: grpc.ServicerContext) -> Any:
@@ -242,9 +207,9 @@ def _answered(call: Call, request: Any, context: grpc.ServicerContext) -> Any:
     try:
         return call(request, context)
     except GoneError:
-        _refuse(context, grpc.StatusCode.CANCELLED, "nobody waits for the answer any more")
+        refuse(context, grpc.StatusCode.CANCELLED, "nobody waits for the answer any more")
     except Exception as error:
-        _refuse(context, *_status_of(error))
+        refuse(context, *_status_of(error))
 
 
 def _status_of(error: BaseException) -> tuple[grpc.StatusCode, str]:
@@ -257,11 +222,6 @@ def _status_of(error: BaseException) -> tuple[grpc.StatusCode, str]:
         return grpc.StatusCode.RESOURCE_EXHAUSTED, str(demand)
     log.error("a request failed", exc_info=error)
     return grpc.StatusCode.INTERNAL, f"{type(error).__name__}: {error}"
-
-
-def _refuse(context: grpc.ServicerContext, code: grpc.StatusCode, said: str) -> NoReturn:
-    context.abort(code, said[:_LONGEST_DETAILS])
-    raise AssertionError("abort raises")
 
 
 def _check_wanted(context: grpc.ServicerContext) -> None:

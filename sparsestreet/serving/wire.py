@@ -1,4 +1,4 @@
-"""The messages of ``SensorsimService``, by which AlpaSim and NuRec ask a renderer for pictures, and of gRPC's health.
+"""The messages of ``SensorsimService``, by which AlpaSim and NuRec ask a renderer for pictures, and of gRPC's own.
 
 The tables below are all there is: descriptors are made of them at import, in a pool of their own, so no code is
 generated and no version of protobuf is pinned. They agree with version 0.55 of AlpaSim's interface (Apache-2.0);
@@ -89,6 +89,22 @@ HealthCheckResponse: status:1 HealthCheckResponse.ServingStatus
 enum HealthCheckResponse.ServingStatus: UNKNOWN 0, SERVING 1, NOT_SERVING 2, SERVICE_UNKNOWN 3
 """
 
+REFLECTION = """
+ServerReflectionRequest: host:1 string, file_by_filename:3 string|message_request, \
+file_containing_symbol:4 string|message_request, file_containing_extension:5 ExtensionRequest|message_request, \
+all_extension_numbers_of_type:6 string|message_request, list_services:7 string|message_request
+ExtensionRequest: containing_type:1 string, extension_number:2 int32
+ServerReflectionResponse: valid_host:1 string, original_request:2 ServerReflectionRequest, \
+file_descriptor_response:4 FileDescriptorResponse|message_response, \
+all_extension_numbers_response:5 ExtensionNumberResponse|message_response, \
+list_services_response:6 ListServiceResponse|message_response, error_response:7 ErrorResponse|message_response
+FileDescriptorResponse: file_descriptor_proto:1 *bytes
+ExtensionNumberResponse: base_type_name:1 string, extension_number:2 *int32
+ListServiceResponse: service:1 *ServiceResponse
+ServiceResponse: name:1 string
+ErrorResponse: error_code:1 int32, error_message:2 string
+"""
+
 PACKAGE = "nre.grpc.protos.sensorsim"
 SERVICES = (f"{PACKAGE}.SensorsimService", "sensorsim.SensorsimService")
 """The same calls by both names: the second is NuRec's from its version 26.10 on."""
@@ -107,7 +123,19 @@ METHODS = {
 }
 """Name of a call -> its request and its answer."""
 
-_PACKAGES = {"common": COMMON, PACKAGE: SENSORSIM, "grpc.health.v1": HEALTH}
+HEALTH_METHODS = {
+    "Check": ("HealthCheckRequest", "HealthCheckResponse"),
+    "Watch": ("HealthCheckRequest", "stream HealthCheckResponse"),
+}
+REFLECTION_METHODS = {"ServerReflectionInfo": ("stream ServerReflectionRequest", "stream ServerReflectionResponse")}
+REFLECTIONS = ("grpc.reflection.v1", "grpc.reflection.v1alpha")
+"""Packages of the same messages and the same call: many tools ask for the older one first."""
+
+_PACKAGES = {"common": COMMON, PACKAGE: SENSORSIM, "sensorsim": "", "grpc.health.v1": HEALTH}
+_PACKAGES |= dict.fromkeys(REFLECTIONS, REFLECTION)
+_NEEDS = {PACKAGE: ("common",), "sensorsim": ("common", PACKAGE)}
+_SERVICES = dict.fromkeys(SERVICES, METHODS) | {"grpc.health.v1.Health": HEALTH_METHODS}
+_SERVICES |= {f"{package}.ServerReflection": REFLECTION_METHODS for package in REFLECTIONS}
 _Field = descriptor_pb2.FieldDescriptorProto
 
 
@@ -118,23 +146,22 @@ def kind(name: str) -> Any:
     >>> kind("common.Vec3")(x=1.5).x
     1.5
     """
-    package = next((package for package in _PACKAGES if name.startswith(f"{package}.")), None)
-    return message_factory.GetMessageClass(_pool().FindMessageTypeByName(name if package else f"{PACKAGE}.{name}"))
+    whole = any(name.startswith(f"{package}.") for package in _PACKAGES)
+    return message_factory.GetMessageClass(pool().FindMessageTypeByName(name if whole else f"{PACKAGE}.{name}"))
 
 
-def descriptor_set() -> bytes:
-    """Return the interface as a ``FileDescriptorSet``, which protoc and grpcurl take in place of .proto files."""
-    files = descriptor_pb2.FileDescriptorSet(file=[_file(*one) for one in _PACKAGES.items()])
-    for name in SERVICES:
+def files() -> list[descriptor_pb2.FileDescriptorProto]:
+    """Return all that the server answers, each file behind those that it needs."""
+    made = [_file(*one) for one in _PACKAGES.items()]
+    for name, methods in _SERVICES.items():
         package, _, service = name.rpartition(".")
-        file = next((one for one in files.file if one.package == package), None) or files.file.add(
-            name=f"{package}.proto", package=package, dependency=[f"{one}.proto" for one in _PACKAGES], syntax="proto3"
-        )
-        made = file.service.add(name=service)
-        for call, kinds in METHODS.items():
-            asked, answered = (f".{kind}" if kind.startswith("common.") else f".{PACKAGE}.{kind}" for kind in kinds)
-            made.method.add(name=call, input_type=asked, output_type=answered)
-    return files.SerializeToString()
+        home = PACKAGE if package == "sensorsim" else package
+        listed = next(file for file in made if file.package == package).service.add(name=service)
+        for call, kinds in methods.items():
+            asked, answered = (_full(kind.removeprefix("stream "), home) for kind in kinds)
+            method = listed.method.add(name=call, input_type=asked, output_type=answered)
+            method.client_streaming, method.server_streaming = (kind.startswith("stream ") for kind in kinds)
+    return made
 
 
 @cache
@@ -144,28 +171,28 @@ def number(enum: str, name: str) -> int:
     >>> number("ImageFormat", "JPEG")
     2
     """
-    return _pool().FindEnumTypeByName(f"{PACKAGE}.{enum}").values_by_name[name].number
+    return pool().FindEnumTypeByName(f"{PACKAGE}.{enum}").values_by_name[name].number
 
 
 @cache
 def word(enum: str, number: int) -> str:
     """The name of a number of an enum; the number itself if it has none."""
-    found = _pool().FindEnumTypeByName(f"{PACKAGE}.{enum}").values_by_number.get(number)
+    found = pool().FindEnumTypeByName(f"{PACKAGE}.{enum}").values_by_number.get(number)
     return str(number) if found is None else found.name
 
 
 @cache
-def _pool() -> Any:
-    pool = descriptor_pool.DescriptorPool()
-    for package, table in _PACKAGES.items():
-        pool.AddSerializedFile(_file(package, table).SerializeToString())
-    return pool
+def pool() -> Any:
+    """Return the descriptors of ``files``, by their names."""
+    made = descriptor_pool.DescriptorPool()
+    for file in files():
+        made.AddSerializedFile(file.SerializeToString())
+    return made
 
 
 def _file(package: str, table: str) -> descriptor_pb2.FileDescriptorProto:
     file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto3")
-    if package == PACKAGE:
-        file.dependency.append("common.proto")
+    file.dependency.extend(f"{one}.proto" for one in _NEEDS.get(package, ()))
     lines = [line.partition(": ") for line in table.strip().splitlines()]
     enums = {head.removeprefix("enum ") for head, _, _ in lines if head.startswith("enum ")}
     messages: dict[str, descriptor_pb2.DescriptorProto] = {}
@@ -188,6 +215,10 @@ def _file(package: str, table: str) -> descriptor_pb2.FileDescriptorProto:
     return file
 
 
+def _full(kind: str, package: str) -> str:
+    return f".{kind}" if kind.startswith("common.") else f".{package}.{kind}"
+
+
 def _add_field(message: descriptor_pb2.DescriptorProto, entry: str, package: str, enums: set[str]) -> None:
     name, _, rest = entry.partition(":")
     place, _, kind = rest.partition(" ")
@@ -199,7 +230,7 @@ def _add_field(message: descriptor_pb2.DescriptorProto, entry: str, package: str
         field.type = getattr(_Field, f"TYPE_{kind.upper()}")
     else:
         field.type = _Field.TYPE_ENUM if kind in enums else _Field.TYPE_MESSAGE
-        field.type_name = f".{kind}" if kind.startswith("common.") else f".{package}.{kind}"
+        field.type_name = _full(kind, package)
     if group:
         groups = [one.name for one in message.oneof_decl]
         if group not in groups:

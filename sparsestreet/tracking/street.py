@@ -11,6 +11,7 @@ from torch import Tensor
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.tracks import with_times
 from sparsestreet.geometry.boxes import box_at
+from sparsestreet.naming import FOUND
 from sparsestreet.tracking.find import find_objects
 from sparsestreet.tracking.objects import FoundObject
 from sparsestreet.tracking.scans import Scan
@@ -96,7 +97,7 @@ def tracks_of(log: DrivingLog, objects: Sequence[FoundObject], classes: Mapping[
     tracks = []
     for number, each in enumerate(objects, 1):
         track = Track(
-            f"found_{number}",
+            f"{FOUND}{number}",
             classes[each.kind],
             torch.from_numpy(each.frames.astype(np.int64)),
             torch.from_numpy(each.world_from_object.astype(np.float64)),

@@ -261,6 +261,7 @@ def evaluate(
             device=device,
             timing=extra.timing,
             training_lpips=extra.training_lpips,
+            log=data.driving_log,
             ranks=ranks,
         )
     extra.measure(scene, data, options, out=out, command=command, say=say)

@@ -272,6 +272,20 @@ def test_without_grpc_a_sentence_names_the_extra(served, capsys, monkeypatch):
     assert "pip install 'sparsestreet[serve]'" in capsys.readouterr().err
 
 
+def test_serve_tells_the_interface_and_needs_no_scene(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert command("serve")(["--proto"]) == 0
+    text = capsys.readouterr().out
+    assert "package nre.grpc.protos.sensorsim;" in text
+    assert "service SensorsimService {" in text
+    assert command("serve")(["--proto", "street.proto"]) == 0
+    assert Path("street.proto").read_text() == text
+    for words, said in (["street.txt"], "written to a .proto"), (["a.proto", "b.proto"], "no option"):
+        assert command("serve")(["--proto", *words]) == 2
+        assert said in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["street.proto"]
+
+
 def test_the_artifact_of_a_run(served, tmp_path, capsys):
     assert command("export")([str(served), str(tmp_path / "street.usdz"), "car=4,1.8,1.5"]) == 0
     assert "scene 'street' with 5 poses, 4 cameras, 0 objects" in capsys.readouterr().out

@@ -14,10 +14,11 @@ from sparsestreet.cli.config.validate import config_problem, override_problem
 from sparsestreet.cli.runs.run import recipe_of
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, OpacityRule, RandomRule
 from sparsestreet.records.configuration import flat_config
+from sparsestreet.scene.body import SmplFile
 from sparsestreet.scene.initialize.sources import ImagePoints
 from sparsestreet.scene.learning_rate import LearningRate
 from sparsestreet.scene.masks import SampledMaskSettings
-from sparsestreet.scene.nodes import BackgroundSettings
+from sparsestreet.scene.nodes import BackgroundSettings, SmplSettings
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, PhaseTimes, Pruning, RowLedger
 from sparsestreet.training.losses import MaskSparsity
 from sparsestreet.training.parallel import DataParallel
@@ -267,3 +268,11 @@ def test_several_processes_are_an_option():
     cfg = composed("trainer=ddp", "trainer.devices=2")
     assert type(instantiate(cfg.trainer.strategy)) is DataParallel
     assert (cfg.trainer.devices, cfg.trainer.accelerator, cfg.optimizer.batch_rule) == (2, "auto", "sqrt")
+
+
+def test_people_with_a_body_of_the_users_need_its_file():
+    """It could not be given: what the built-in body has was merged into it, and a path was no key."""
+    chosen = ("method=omnire", "preset=drivestudio", "body@node.smpl.body=smpl_file")
+    assert config_problem(composed(*chosen)) == "node.smpl.body.path has no value: give node.smpl.body.path=..."
+    people = recipe_of(composed(*chosen, "node.smpl.body.path=SMPL.npz")).nodes["smpl"]
+    assert as_a(SmplSettings, people).body == SmplFile("SMPL.npz")

@@ -107,7 +107,7 @@ def sized(name: str, words: list[str], tiny_street: list[str]) -> list[str]:
         "data": [*words, *(SMALL if "data=synthetic" in words else [])],
         "render": [*words, "frames=0:2", "fps=10"],
         "view": [*ports, "port=0"],
-        "serve": [*ports, "port=0"],
+        "serve": words if "--proto" in words else [*ports, "port=0"],
     }.get(name, words)
 
 

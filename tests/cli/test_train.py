@@ -152,8 +152,11 @@ def test_training_ends_with_its_result(finished):
     summary = SUMMARY.read(finished)
     lines = (finished / "train.log").read_text().splitlines()
     first = next(index for index, line in enumerate(lines) if "held-out views: PSNR" in line)
-    quality, _, size, places = lines[first : first + 4]
+    quality, _, ranges, size, places = lines[first : first + 5]
     assert f"held-out views: PSNR {summary.mean('psnr_full'):.2f} dB, vehicles " in quality
+    seen = there(summary.geometry).groups["seen"]
+    assert "ranges along the rays of " in ranges
+    assert f"held-out sweeps: median error in images {seen.median:.3f} m ({100 * there(seen.within):.0f} % w" in ranges
     assert f"{summary.gaussians_total:,} Gaussians, {summary.bytes_total / 1e6:.2f} MB, " in size
     assert places.endswith(
         f"pictures: {finished}/pictures/sheet.png; curves: {finished}/curves; numbers: {finished}/records"
@@ -163,7 +166,8 @@ def test_training_ends_with_its_result(finished):
 def test_costs_of_a_run(finished):
     costs, summary = COSTS.read(finished), SUMMARY.read(finished)
     stages = {"start", "data", "points", "initialize", "train", "validate", "prune", "save"}
-    assert set(costs.phases) == stages | {"effects", "evaluate", "latency", "costs", "gains", "pictures", "other"}
+    stages |= {"effects", "evaluate", "latency", "costs", "geometry", "gains", "pictures", "other"}
+    assert set(costs.phases) == stages
     assert all(seconds > 0 for seconds in costs.phases.values())
     assert list(costs.passes) == [f"LeaveOneOutRule at step {step}" for step in (24, 30, 36)]
     assert sum(costs.passes.values()) == pytest.approx(costs.phases["prune"], rel=1e-4)  # six digits each

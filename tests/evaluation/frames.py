@@ -6,6 +6,7 @@ from typing import Any
 import torch
 
 from sparsestreet.records.configuration import Setting, config_hash
+from sparsestreet.records.geometry import Geometry, RangeErrors
 from sparsestreet.records.run import CodeVersion, Machine, Noise, RunDescription
 from sparsestreet.records.summary import (
     FRAME,
@@ -154,6 +155,14 @@ def make_summary(
         latency_protocol=latency.protocol,
         guards=GuardCounts({"drawn": 900, "overflowed": 0} | (alarms or {}), alarms or {}),
     )
+
+
+def with_ranges(summary: RunSummary, median: float | None, within: float, **groups: RangeErrors) -> RunSummary:
+    """The record of a log with lidar: errors of the rays that cameras see, those of all are larger."""
+    seen = RangeErrors(900, 0 if median is None else 800, median, median, within, median)
+    everything = replace(seen, returns=2000, median=9.0, within=0.1)
+    found = {"all": everything, "seen": seen} | groups
+    return replace(summary, geometry=Geometry(split=HELD_OUT, sweeps=(5, 15), strides=(2, 2), pixel=0.2, groups=found))
 
 
 def disturbed(summary: RunSummary, *clocks: str) -> RunSummary:

@@ -36,6 +36,22 @@ def naive_image(
     return image
 
 
+def naive_median_depth(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> np.ndarray:
+    """Depth of the splat behind which less than half of the light is left, of each pixel; infinite where more is."""
+    splats = sorted(_naive_splats(gaussians, view, settings), key=lambda item: item[0])
+    depth = np.full((view.height, view.width), np.inf)
+    for row, column in np.ndindex(depth.shape):
+        passed = 1.0
+        for z, mean, conic, opacity, _ in splats:
+            d = np.array([column + 0.5, row + 0.5]) - mean
+            alpha = min(settings.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
+            passed *= 1 - (alpha if alpha >= settings.alpha_min else 0.0)
+            if passed < 0.5:
+                depth[row, column] = z
+                break
+    return depth
+
+
 def _naive_splats(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> list[tuple]:
     pose, intrinsics = view.camera_from_world.double().numpy(), view.intrinsics.double().numpy()
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]

@@ -1,14 +1,16 @@
 """Records are found, once each, and what is wrong is named."""
 
+import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from sparsestreet.records.strict_json import RecordError
 from sparsestreet.records.summary import SUMMARY
-from sparsestreet.report.collect import collect
-from tests.evaluation.frames import make_summary
+from sparsestreet.report.collect import RunRecord, collect, keep_records
+from tests.evaluation.frames import make_summary, with_ranges
 
 
 def test_collect_finds_each_run_once(tmp_path):
@@ -18,6 +20,14 @@ def test_collect_finds_each_run_once(tmp_path):
     assert [record.summary.run.label for record in found] == ["a/run", "b"]
     assert found[1].folder == (tmp_path / "b").resolve()
     assert collect([tmp_path / "b"])[0].summary.run.label == "b"  # the run's folder itself
+
+
+def test_a_kept_record_has_the_errors_of_ranges(tmp_path):
+    for name, run in (("a", make_summary()), ("b", with_ranges(make_summary(), 0.125, 0.5))):
+        keep_records([RunRecord(Path(name), run)], tmp_path / name)
+    without, heard = (json.loads((tmp_path / name).read_text()) for name in "ab")
+    assert "geometry" not in without
+    assert (heard["geometry"]["seen"]["median"], heard["geometry"]["all"]["median"]) == (0.125, 9.0)
 
 
 def test_collect_names_what_is_wrong(tmp_path):

@@ -13,7 +13,7 @@ from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.paper import TABLES, metric_id, paper_table
 from sparsestreet.report.sections import sections
 from sparsestreet.report.variants import Variant, variants
-from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary
+from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary, with_ranges
 from tests.records.novel import write_beside
 from tests.report.sweep_folder import record
 from tests.typed import there
@@ -64,6 +64,20 @@ def test_another_sweep_has_rows_of_its_own_only(found):
     titles = ["omnire-legacy", "omnire-legacy+paper (1 of 2 runs ‡)", "omnire-legacy+removal (1 of 2 runs ‡)"]
     assert list(rows_of(grid)) == titles
     assert "of other data: to be read beside ours, not against it" in grid.notes[0]
+
+
+def test_ranges_stand_behind_quality_where_a_run_has_lidar(found):
+    """Means over the runs that hold views out; a dash for a run without lidar, and for those of the paper."""
+    heard = [replace(one, summary=with_ranges(one.summary, 0.131, 0.5)) for one in RUNS[:2]] + RUNS[2:]
+    failure = FailedRun(label="omnire+masks", seed=2, command="", error="out of memory", trace="")
+    for sweep in ("table1_waymo", "streets"):
+        grid = paper_table(variants(heard), [(Path("x"), failure)], DRIVESTUDIO, sweep)
+        assert grid.header[-2:] == (("lidar", "median range error, m"), ("lidar", "within 0.2 m, %"))
+        rows = {row[0].text: [cell.text for cell in row[-2:]] for row in grid.rows}
+        assert rows["omnire-legacy"] == ["0.131", "50.0"]
+        assert rows["omnire-legacy+paper (1 of 2 runs ‡)"] == ["-", "-"]
+        assert rows["omnire+masks, seed 2: failed, out of memory"] == ["-", "-"]
+    assert "lidar" not in {group for group, _ in paper_table(found, [], DRIVESTUDIO, "streets").header}
 
 
 def test_failed_runs_stand_as_failed(found):

@@ -7,10 +7,11 @@ import pytest
 
 from sparsestreet.records.costs import EffectGain, update_costs
 from sparsestreet.records.curves import HELD_OUT_CURVE, HeldOutLook
+from sparsestreet.records.geometry import RangeErrors
 from sparsestreet.records.run import EffectDecision
 from sparsestreet.records.summary import HELD_OUT, MetricSummary
 from sparsestreet.report.result import result_lines
-from tests.evaluation.frames import disturbed, make_summary
+from tests.evaluation.frames import disturbed, make_summary, with_ranges
 
 
 def test_what_a_run_came_to():
@@ -23,6 +24,17 @@ def test_what_a_run_came_to():
     # 59 float32 a Gaussian, and 100 seconds of training, says make_summary.
     assert size.startswith("15,613 Gaussians, 3.68 MB, 100 s of training, 40.0 ms a frame")
     assert places == "pictures: outputs/a/pictures/sheet.png; curves: outputs/a/curves; numbers: outputs/a/records"
+
+
+def test_ranges_are_said_where_lidar_measured_them():
+    vehicles = RangeErrors(90, 90, 0.0931, 0.2, 0.646, 0.1)
+    lines = result_lines(with_ranges(make_summary("plain"), 0.1304, 0.654, vehicles=vehicles), Path("a"))
+    assert lines[1] == (
+        "ranges along the rays of 2 held-out sweeps: median error in images 0.130 m (65 % within 0.2 m), "
+        "on vehicles 0.093 m (65 % within 0.2 m)"
+    )
+    none = result_lines(with_ranges(make_summary("plain"), None, 0.0), Path("a"))
+    assert not any("ranges" in line for line in none)
 
 
 @pytest.mark.parametrize(("psnr", "training"), [(None, 26.0), (25.0, None)])

@@ -15,7 +15,7 @@ from sparsestreet.records.summary import HELD_OUT, Evaluation, MetricSummary
 from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.sections import section_tables, sections, sections_markdown, size_figure
 from sparsestreet.report.tables import Spread
-from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary
+from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary, with_ranges
 from tests.report.sweep_folder import record
 from tests.typed import as_a
 
@@ -30,6 +30,18 @@ PLAIN_AND_OURS = records(
     make_summary("ours", 0, psnr=24.9, gaussians={"background": 300, "rigid": 100}, milliseconds=20.0),
     make_summary("ours", 1, psnr=26.6, gaussians={"background": 340, "rigid": 60}, milliseconds=30.0),
 )
+
+
+def test_ranges_have_columns_differences_and_a_note():
+    heard = [with_ranges(make_summary(label, 0), *numbers) for label, *numbers in (("a", 0.1, 0.5), ("b", 0.15, 0.25))]
+    (section,) = sections(records(*heard, make_summary("c", 0)), "a")
+    rows = by_label(section)
+    means = {label: cells(row, section) for label, row in rows.items()}
+    assert (means["a"]["median range error, m"].mean, means["a"]["within 0.2 m, %"].mean) == (0.1, 50.0)
+    assert means["b against a"]["median range error, m"].mean == pytest.approx(0.05)
+    assert means["b against a"]["within 0.2 m, %"].mean == -25.0
+    assert means["c"]["median range error, m"] is None
+    assert any(note.startswith("median range error: along the rays of held-out sweeps") for note in section.notes)
 
 
 def cells(row, section):
@@ -54,6 +66,9 @@ def test_rows_hold_mean_spread_and_number_of_runs():
     assert found["train s"].mean == 110.0
     assert cells(ours, section)["ms/frame"].mean == 25.0
     assert "vehicle SSIM" not in found  # no run has it
+
+    assert "median range error, m" not in found
+    assert not any("range error" in note for note in section.notes)
 
     found = cells(difference, section)
     assert found["PSNR"].mean == pytest.approx((-0.1 - 0.4) / 2)  # paired by seed

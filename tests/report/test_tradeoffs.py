@@ -11,7 +11,7 @@ from sparsestreet.report.collect import run_frame
 from sparsestreet.report.tables import spread
 from sparsestreet.report.tradeoffs import differences, matched_budget, matched_quality, measures, paired, summary_line
 from sparsestreet.report.variants import variants
-from tests.evaluation.frames import disturbed, make_summary
+from tests.evaluation.frames import disturbed, make_summary, with_ranges
 from tests.report.sweep_folder import record, street_runs
 
 
@@ -117,6 +117,7 @@ def apart(label, quality, gaussians, milliseconds, seconds):
     summary = make_summary(label, 0, gaussians={"a": gaussians}, milliseconds=milliseconds, training_seconds=seconds,
                            training_psnr=1.0)  # fmt: skip
     held_out = {name: MetricSummary(value, None, 1, 0) for name, value in metrics.items()}
+    summary = with_ranges(summary, quality / 100, quality / 50)
     return replace(summary, quality=summary.quality | {HELD_OUT: held_out})
 
 
@@ -133,6 +134,7 @@ def test_every_column_has_a_difference_of_its_own(protocol):
         "n": "1",
         **dict.fromkeys(("PSNR full", "PSNR human", "PSNR vehicle"), "+0.50"),
         **dict.fromkeys(("SSIM full", *networks), "+0.5000"),
+        **{"median range error, m": "+0.005", "within 0.2 m, %": "+1.0"},
         **{"Gaussians, %": "-75.0", "MB, %": "-75.0", "ms/frame, %": "-50.0", "train s, %": "-10.0"},
     }
     assert {cell.runs for cell in row.values()} == {("r", "p")}

@@ -1,6 +1,9 @@
 """The server over a loopback, called by a client that was made of AlpaSim's messages."""
 
 import re
+import shlex
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from sparsestreet.cli.commands.serve import serve
 from sparsestreet.ops.cpu import rasterizer
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.serving import renderer, wire
@@ -72,18 +76,20 @@ def test_the_log_says_once_that_a_picture_from_elsewhere_is_a_guess(client, capl
     assert 2.5 < float(said) < 3.5
 
 
-def test_the_client_of_the_page_gets_a_picture_and_the_interface(client, tmp_path, monkeypatch):
+def test_the_client_of_the_page_gets_a_picture(client, tmp_path, monkeypatch):
+    """Compiled by protoc, as the page says."""
+    protoc = pytest.importorskip("grpc_tools.protoc", reason="pip install grpcio-tools")
     monkeypatch.chdir(tmp_path)
-    page = (Path(__file__).parents[2] / "docs" / "serving.md").read_text()
-    codes = re.findall(r"```python\n(.*?)```", page.partition("## In Python, without")[0], flags=re.S)
+    page = (Path(__file__).parents[2] / "docs" / "serving.md").read_text().partition("## In Python, without")[0]
+    (code,) = re.findall(r"```python\n(.*?)```", page, flags=re.S)
+    assert serve(shlex.split(re.findall(r"^sparsestreet serve (--proto .*)", page, flags=re.M)[0])) == 0
+    (compiles,) = re.findall(r"^python -m grpc_tools.protoc (.*)", page, flags=re.M)
+    assert protoc.main(["protoc", *shlex.split(compiles)]) == 0
     port = client.channel._channel.target().decode().rpartition(":")[2]
-    names: dict[str, Any] = {}
-    for code in codes:
-        exec(code.replace("127.0.0.1:50051", f"127.0.0.1:{port}"), names)
-    names["channel"].close()
-    seen = decoded(names["image"]).astype(int)
+    (tmp_path / "client.py").write_text(code.replace("127.0.0.1:50051", f"127.0.0.1:{port}"))
+    subprocess.run([sys.executable, "client.py"], check=True, timeout=60)  # its messages are no others of ours
+    seen = decoded((tmp_path / "street.png").read_bytes()).astype(int)
     assert np.abs(seen - rendered(timed_views()[0])).max() <= 2  # two float32 poses one after the other
-    assert (tmp_path / "sensorsim.protoset").read_bytes() == wire.descriptor_set()
 
 
 def test_a_batch_is_its_singles_and_says_which_camera_failed(client):
@@ -243,6 +249,18 @@ def test_errors_are_statuses_and_the_server_goes_on(client, changes, code, said)
     assert picture(client, view)
 
 
+def test_the_log_says_which_objects_float_or_are_not_there(client, caplog):
+    request = request_for(timed_views()[8])
+    place(request, "tram", at(9.0, 0.0, 5.5))
+    client.render_rgb(theirs(request))
+    place(request, "trams", at(9.0, 0.0, 1.0))
+    with pytest.raises(grpc.RpcError, match="no object 'trams'"):
+        client.render_rgb(theirs(request))
+    floats, refused = caplog.messages
+    assert re.match(r"street: tram is [45]\.\d m above the ground", floats)
+    assert refused == "street: requests that name trams are refused: there is no such object"
+
+
 def test_an_error_that_repeats_a_long_name_is_still_its_status(client):
     request = request_for(timed_views()[0])
     place(request, "x" * 100_000, at(0.0, 0.0, 0.0))
@@ -261,16 +279,18 @@ def test_what_is_not_there_yet_is_unimplemented(client, call):
     assert "lidar" in there(caught.value.details())
 
 
-def test_bytes_that_are_no_message_get_a_status(client):
+def test_bytes_that_are_no_message_get_a_status(client, caplog):
     call = client.channel.unary_unary("/nre.grpc.protos.sensorsim.SensorsimService/render_rgb")
-    with pytest.raises(grpc.RpcError):
+    with pytest.raises(grpc.RpcError, match="make messages of `serve --proto`") as caught:
         call(b"\xff" * 100, timeout=60)
+    assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
+    assert caplog.text == ""
     assert picture(client, timed_views()[0])
 
 
 def test_a_call_that_never_ends_its_message_gives_its_place_back(tmp_path, monkeypatch):
     """Four take all workers and all places; one that is closed without a message is told so."""
-    monkeypatch.setattr("sparsestreet.serving.server.WHOLE_MESSAGE", 0.5)
+    monkeypatch.setattr("sparsestreet.serving.standard.WHOLE_MESSAGE", 0.5)
     monkeypatch.setattr("sparsestreet.serving.server.MAX_WAITING", 4)
     runs = named_runs([write_run(tmp_path / "street")])
     server, port = start(Scenes(runs, load_scene, memory=10**9), "127.0.0.1", 0, workers=4)

@@ -233,6 +233,7 @@ def test_an_evaluation_is_handed_all_that_it_is_given(tmp_path, monkeypatch):
         assert run.evaluate(scene, options, frames, **told, extra=extra, say=said) is summary
     held_out, training = frames.split.held_out, frames.split.train
     measured = {"run": summary.run, "options": options, "timing": extra.timing, "ranks": ALONE} | told
+    measured |= {"log": frames.driving_log}
     assert called == [
         ((scene, held_out, training), measured),
         (extra, (scene, frames, options), {"out": tmp_path, "command": "typed", "say": said}),

@@ -2,15 +2,19 @@
 
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from sparsestreet.atomic import atomic_file
 from sparsestreet.cli.commands.options import run_command
 from sparsestreet.listening import opened_at
 from sparsestreet.naming import one_line
 
 USAGE = """\
 sparsestreet serve RUN[,RUN] [key=value ...]     pictures for simulators over gRPC (docs/serving.md)
+sparsestreet serve --proto [FILE]                the interface as a .proto, on the screen or in a file
 
   sparsestreet serve outputs/RUN                                a street at 127.0.0.1:50051, until Ctrl-C
   sparsestreet serve outputs/A,outputs/B memory=4               two; scene files of at most 4 GB are open at a time
@@ -58,9 +62,43 @@ class ServeRequest:
             raise ValueError(f"mount is three numbers, ahead, left and up, got {len(self.mount)}")
 
 
+@dataclass(frozen=True)
+class ProtoRequest:
+    """Where the interface is written. Raises ValueError for a file of another kind."""
+
+    proto: bool
+    out: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.out is not None and self.out.suffix != ".proto":
+            raise ValueError(f"the interface is written to a .proto, got {str(self.out)!r}")
+
+
 def serve(arguments: list[str]) -> int:
-    """Serve until Ctrl-C or SIGTERM; 2 on wrong usage, 1 if something is missing."""
+    """Serve until Ctrl-C or SIGTERM, or tell the interface; 2 on wrong usage, 1 if something is missing."""
+    if "--proto" in arguments:
+        words = ["proto=true" if word == "--proto" else word for word in arguments]
+        return run_command("serve", USAGE, words, ProtoRequest, _tell, positional=("out",))
     return run_command("serve", USAGE, arguments, ServeRequest, _serve, positional=("scene",))
+
+
+@contextmanager
+def _extra() -> Iterator[None]:
+    """Name the extra where a package of it is missing."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(f"serving needs {error.name}: pip install 'sparsestreet[serve]'") from error
+
+
+def _tell(request: ProtoRequest) -> None:
+    with _extra():
+        from sparsestreet.serving.interface import proto_text
+    if request.out is None:
+        print(proto_text(), end="")
+    else:
+        with atomic_file(request.out) as temporary:
+            temporary.write_text(proto_text(), encoding="utf-8")
 
 
 def _serve(request: ServeRequest) -> None:
@@ -68,10 +106,8 @@ def _serve(request: ServeRequest) -> None:
     from sparsestreet.cli.commands.scenes import open_scene
     from sparsestreet.serving.renderer import RigOptions, Scenes, named_runs
 
-    try:
+    with _extra():
         from sparsestreet.serving.server import start
-    except ModuleNotFoundError as error:
-        raise ModuleNotFoundError(f"serving needs {error.name}: pip install 'sparsestreet[serve]'") from error
     options = RigOptions(request.mount, request.names, request.log_fps)
     scenes = Scenes(
         named_runs(request.scene),

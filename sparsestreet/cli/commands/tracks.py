@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 from sparsestreet.cli.config.log_from_options import UsageError, configured_log, reader_of, without_folder
 from sparsestreet.cli.config.validate import type_problem
+from sparsestreet.naming import FOUND
 
 if TYPE_CHECKING:
     from jaxtyping import Float64
@@ -92,7 +93,7 @@ def table(log: "DrivingLog", objects: "Sequence[FoundObject]") -> "Iterator[str]
         sizes = ", ".join(f"{one:.2f} ± {off:.2f}" for one, off in zip(each.size, each.size_unsure, strict=True))
         speed = each.path_length / seconds if seconds > 0 else 0.0
         yield (
-            f"{f'found_{number}':<10}{each.kind:<12}{f'{first} to {last}':>10}{int(each.returns.sum()):>9,}  "
+            f"{f'{FOUND}{number}':<10}{each.kind:<12}{f'{first} to {last}':>10}{int(each.returns.sum()):>9,}  "
             f"{sizes:<40}{each.path_length:>9.1f}{speed:>6.1f}{each.confidence:>6.2f}"
         )
 

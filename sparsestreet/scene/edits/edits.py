@@ -3,9 +3,8 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-import torch
-
 from sparsestreet.naming import nearest, one_line
+from sparsestreet.scene.edits.ground import Ground
 from sparsestreet.scene.edits.nodes import ALWAYS, AddedObject, Change, EditedNode, recorded_frames
 from sparsestreet.scene.edits.paths import AsRecorded, Driven, Frame, Held, Moved, Recorded
 from sparsestreet.scene.graph import SceneGraph
@@ -14,11 +13,6 @@ from sparsestreet.scene.nodes.tracked import Rigid, Tracked
 
 Object = tuple[str, Tracked, int]
 """Name of a node, the node, and the number of one of its objects."""
-
-_LAYER = 0.3
-"""Meters of height that hold the ground; walls and trees spread over more, and so do guesses below it."""
-_ENOUGH = 5
-"""Gaussians around a place to tell the ground's height by."""
 
 REMOVED = Change(hidden=(ALWAYS,))
 
@@ -114,34 +108,12 @@ def _added(scene: SceneGraph, objects: Mapping[str, Object], name: str, one: Add
     return AddedObject(name, source, instance, change, recorded, to_source=lambda time: one.speed * time)
 
 
-def ground_below(scene: SceneGraph, x: float, y: float) -> float | None:
-    """Return the height of the ground at a place of the world, meters; None where nothing stands still within 8 m.
-
-    It is that of the layer with most opacity of nodes without tracks, in the smallest circle that has enough of them.
-    """
-    rows = [node.rows for node in scene.nodes.values() if not isinstance(node, Tracked | EditedNode | AddedObject)]
-    if not rows:
-        return None
-    means = torch.cat([one.means.detach() for one in rows])
-    weights = torch.cat([one.opacity_logits.detach().flatten().sigmoid() for one in rows])
-    away = torch.linalg.vector_norm(means[:, :2] - means.new_tensor([x, y]), dim=1)
-    for radius in (1.0, 2.0, 4.0, 8.0):
-        near = away < radius
-        if int(near.sum()) >= _ENOUGH:
-            heights, order = means[near, 2].sort()
-            below = torch.nn.functional.pad(weights[near][order].cumsum(0), (1, 0))
-            held = below[torch.searchsorted(heights, heights + _LAYER, right=True)] - below[:-1]
-            start = float(heights[held.argmax()])
-            layer = (heights >= start) & (heights <= start + _LAYER)
-            return float(heights[layer].median())
-    return None
-
-
 def off_the_ground(scene: SceneGraph, edits: Edits) -> dict[str, float]:
     """Return how far objects on ways of their own stand above the ground (below: negative), where most; meters.
 
     Left out are those for which nobody knows.
     """
+    ground = Ground(scene)
     objects = objects_of(scene)
     ways = {name: (found(objects, name), change.path) for name, change in edits.changes.items()}
     for name, one in edits.added.items():
@@ -153,17 +125,18 @@ def off_the_ground(scene: SceneGraph, edits: Edits) -> dict[str, float]:
         if isinstance(path, Driven):
             recorded = recorded_frames(node, instance)
             places = [path.frame(time, recorded)[:3, 3].tolist() for time in path.times]
-            grounds = [(z - node.frame_height(instance), ground_below(scene, x, y)) for x, y, z in places]
-            heights = [feet - ground for feet, ground in grounds if ground is not None]
+            heights = [ground.off(x, y, z - node.frame_height(instance)) for x, y, z in places]
+            heights = [off for off in heights if off is not None]
             off |= {name: max(heights, key=abs)} if heights else {}
     return off
 
 
 def _on_the_ground(scene: SceneGraph, name: str, path: Driven, height: float) -> Driven:
-    grounds = [ground_below(scene, x, y) for x, y in path.positions]
-    if missing := [place for place, ground in zip(path.positions, grounds, strict=True) if ground is None]:
+    ground = Ground(scene)
+    grounds = [ground.below(x, y) for x, y in path.positions]
+    if missing := [place for place, below in zip(path.positions, grounds, strict=True) if below is None]:
         raise ValueError(f"nothing stands still within 8 m of {missing[0]}, where {name!r} goes: say z in its path")
-    return replace(path, heights=[height + ground for ground in grounds if ground is not None])
+    return replace(path, heights=[height + below for below in grounds if below is not None])
 
 
 def _on_the_same_ground(source: Tracked, instance: int, other: Tracked, other_instance: int) -> Recorded:
