@@ -226,14 +226,15 @@ def test_an_evaluation_is_handed_all_that_it_is_given(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "draw_history", lambda out: called.append(out))
     monkeypatch.setattr(ExtraMetrics, "measure", lambda self, *args, **how: called.append((self, args, how)))
     RUN.write(tmp_path, summary.run)
-    scene, frames, extra = SceneGraph({"background": background(1)}), data(), ExtraMetrics(timing=Timing(3, 4, 5))
+    scene, frames = SceneGraph({"background": background(1)}), data()
+    extra = ExtraMetrics(timing=Timing(3, 4, 5), training_lpips=True)
     options, device, said = RenderOptions(SplatSettings(near_plane=0.3)), torch.device("cpu", 0), print
     told = {"out": tmp_path, "device": device, "command": "typed"}
     with StageRecorder() as stages:
         assert run.evaluate(scene, options, frames, **told, extra=extra, say=said) is summary
     held_out, training = frames.split.held_out, frames.split.train
     measured = {"run": summary.run, "options": options, "timing": extra.timing, "ranks": ALONE} | told
-    measured |= {"log": frames.driving_log}
+    measured |= {"log": frames.driving_log, "training_lpips": True}
     assert called == [
         ((scene, held_out, training), measured),
         (extra, (scene, frames, options), {"out": tmp_path, "command": "typed", "say": said}),
