@@ -24,6 +24,7 @@ IDENTITY_KEYS = (
     "trunk",  # the run whose first steps this one takes; they are its own as well
     "checkpoint_every",
     "branch_points",
+    "keep_checkpoints",
     "out",
     "folder",
     "capacity.*",  # its numbers are compared where they act

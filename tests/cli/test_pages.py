@@ -3,6 +3,7 @@
 import importlib
 import re
 import shlex
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -14,6 +15,7 @@ import torch
 from sparsestreet.cli import COMMANDS, MODULES
 from sparsestreet.cli.commands.options import OptionError, parse_options
 from sparsestreet.cli.config.validate import override_problem, with_effect_keys
+from sparsestreet.cli.runs.costs import Assumptions
 from sparsestreet.data.drivestudio import DriveStudioReader
 from tests.cli.page_commands import RUN_ELSEWHERE, SHOWN, commands_of, elsewhere
 from tests.conftest import unchecked
@@ -38,6 +40,7 @@ def problem_of(command: str) -> str | None:
         return None
     if name in OF_HYDRA:
         own = ("from=", "to=", "layout", "jpeg_quality=", "flavor=", "model=", "classes=")
+        own += tuple(f"{one.name}=" for one in fields(Assumptions)) if name == "jobs" else ()
         words = [word for word in words if not word.startswith(own)]
         words = [word for word in words if "=" in word or word.startswith("-")] if name == "data" else words
         several = ["-m"] if any(word.startswith("+sweep=") for word in words) else []

@@ -6,12 +6,12 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from sparsestreet.cli.commands.jobs import JobComposer, SweepCount, count_jobs
-from sparsestreet.cli.commands.jobs import jobs as jobs_command
+from sparsestreet.cli.commands.jobs import count_jobs
 from sparsestreet.cli.commands.train import train
 from sparsestreet.cli.config.compose import CONF, as_typed
 from sparsestreet.cli.config.validate import config_problem
 from sparsestreet.cli.runs import sweep
+from sparsestreet.cli.runs.jobs import JobComposer
 from sparsestreet.cli.runs.sweep import (
     OF_DRIVES,
     as_sweep,
@@ -218,11 +218,6 @@ def test_a_job_that_cannot_be_ends_a_sweep_before_its_first_training(capsys):
     assert "node.background.sh_degree must be int, got 'many'; nothing was trained" in said
     assert job_problem(["-m", "sparsify=removal,random", "count_of=of/nothing"]) is None
     assert job_problem(["sparsify=none"]) is None
-
-
-def test_jobs_of_the_command_line_are_counted(capsys):
-    assert count_jobs(["-m"], ["sparsify=none,removal", "seed=0"]) == [SweepCount("-m", 2, 0, 0.0)]
-    assert jobs_command(["sparsify=none"]) == 2
 
 
 @pytest.mark.lengthy

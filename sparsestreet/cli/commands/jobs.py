@@ -1,45 +1,49 @@
-"""``sparsestreet jobs +sweep=NAME,...``: what sweeps would train, before anybody starts them."""
+"""``sparsestreet jobs +sweep=NAME,...``: what sweeps would train and what that costs, before anybody starts them."""
 
-import math
-import os
 import sys
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from hydra import compose
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 from rich.table import Table
 
-from sparsestreet.cli.config.compose import as_typed, configuration, resolved
+from sparsestreet.cli.commands.options import parse_options
+from sparsestreet.cli.config.compose import as_typed, configuration
 from sparsestreet.cli.config.validate import SWEEPS, flags_of, override_problem
-from sparsestreet.cli.runs.folder import first_pruning, identity_of_trunk, moments_to_keep
-from sparsestreet.cli.runs.sweep import ALIKE, finished, jobs_of, with_fixed_keys
-from sparsestreet.records.configuration import flat_config
+from sparsestreet.cli.runs.costs import Assumptions, MeasuredRun, cost_of, measured_runs
+from sparsestreet.cli.runs.jobs import Job, dealt, jobs_of_sweep
+from sparsestreet.cli.runs.sweep import with_fixed_keys
 
 USAGE = """\
-sparsestreet jobs +sweep=NAME[,NAME ...] [key=value ...]
-sparsestreet jobs -m key=value,value [key=value ...]
+sparsestreet jobs +sweep=NAME[,NAME ...] [key=value ...] [measured=DIR] [devices=N]
+                            [ms_per_step=N] [gaussians=N] [image=WIDTHxHEIGHT]
+sparsestreet jobs -m key=value,value [key=value ...] [...]
 
 What sweeps of conf/sweep, or one of the command line, would train, with the options that train would get; nothing is
 trained or written. A job that stands finished in its folder is not trained again. In a sweep that names a trunk
-(conf/train.yaml), a job that differs from it only in what it prunes begins with its checkpoint (branch_points). So the
-last column has what is trained in whole runs. Drives need not be there: data.root=a,b,c counts three, and
-data.root=@FILE the folders that the lines of a file name.
+(conf/train.yaml), a job that differs from it only in what it prunes begins with its checkpoint (branch_points): "whole
+runs" counts so. Drives need not be there: data.root=a,b,c counts three, and data.root=@FILE the folders that the
+lines of a file name.
+
+Hours, memory and disk of the jobs that are left come from finished runs in the sweep's folder and in measured=DIR. A
+run speaks for a job of its label, or else of its method with any sparsification; preset, capacity, reader, image size,
+kind of device and limits of Gaussians must agree. Hours (means) are scaled by the steps that the job trains, memory is
+the largest peak, disk what finished runs leave, without checkpoints. Where no run is like a job: hours are its steps at
+ms_per_step=N alone; memory is the count that trainings check themselves by, of gaussians=N or the nodes' max_gaussians
+on image=WIDTHxHEIGHT; disk is the scene of so many. A cell without a source for each job is "-", and a line says what
+would fill it. "hours" are those of one device; with devices=N also the hours of the longest shard (train shard=K/N).
 """
 
 
 COMMAND_LINE = "-m"
 """What a sweep is called that no file of conf/sweep holds."""
-_EVERY = 5.0
-"""Seconds after which a line says how far the count is: a composition takes one of a busy machine."""
-_OF_DRIVE = ("data.log.", "data.root", "seed")
-"""Options that tell drives and seeds apart, or follow from them."""
+_MIN_WIDTH = 100
+"""Letters of a line: no column is cut where a terminal has fewer."""
+QUANTITIES = ("hours", "memory", "disk")
 
 
 def _sweep(name: str) -> list[str]:
@@ -48,7 +52,7 @@ def _sweep(name: str) -> list[str]:
 
 @dataclass(frozen=True)
 class SweepCount:
-    """Jobs of a sweep, and those that stand finished.
+    """Jobs of a sweep, those that stand finished, and what the rest costs; None: unknown of some job.
 
     ``shared``: what the rest need not train because it begins with a checkpoint of its trunk, in whole runs.
     """
@@ -57,6 +61,16 @@ class SweepCount:
     jobs: int
     finished: int
     shared: float = 0.0
+    hours: float | None = 0.0
+    """Of one device."""
+    longest: float | None = 0.0
+    """Hours of the longest shard."""
+    memory: float | None = 0.0
+    """Bytes of the largest job."""
+    disk: float | None = 0.0
+    """Bytes of all."""
+    sources: Counter[tuple[str, str]] = field(default_factory=Counter, compare=False)
+    """Quantity and source -> number of jobs."""
 
     @property
     def trainings(self) -> int:
@@ -69,7 +83,9 @@ class SweepCount:
 
 def jobs(arguments: list[str]) -> int:
     """Print the counts; 2 on wrong usage."""
-    arguments = as_typed(arguments)
+    own = {one.name for one in fields(Assumptions)}
+    words = [text for text in arguments if text.partition("=")[0] in own]
+    arguments = as_typed([text for text in arguments if text not in words])
     named = [name for text in arguments if text.startswith("+sweep=") for name in text[7:].split(",")]
     names = named or [COMMAND_LINE]
     if "--help" in arguments or not (named or SWEEPS & flags_of(arguments)):
@@ -81,119 +97,112 @@ def jobs(arguments: list[str]) -> int:
         print(f"sparsestreet jobs: {problem}", file=sys.stderr)
         return 2
     try:
-        Console().print(_table(count_jobs(names, rest)))
+        said = parse_options(words, Assumptions)
+        counts = count_jobs(names, rest, said)
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         print(f"sparsestreet jobs: {str(error).splitlines()[0]}", file=sys.stderr)
         return 2
+    console = Console()
+    console.print(_table(counts, said.devices), width=max(console.width, _MIN_WIDTH), crop=False)
+    for line in _sources(counts):
+        print(line)
     return 0
 
 
-def count_jobs(names: Sequence[str], overrides: Sequence[str]) -> list[SweepCount]:
-    """The counts of each sweep, in their order. Raises what Hydra raises for options that do not compose."""
+def count_jobs(names: Sequence[str], overrides: Sequence[str], said: Assumptions | None = None) -> list[SweepCount]:
+    """Return the counts of each sweep, in their order.
+
+    Raises what Hydra raises for options that do not compose, RecordError for a damaged record of a finished run.
+    """
+    said = said or Assumptions()
     counts = []
     with configuration():
         for name in names:
-            before: dict[Path, _Job] = {}
-            shared = 0.0
-            for job in _jobs_of(with_fixed_keys(["-m", *_sweep(name), *overrides])[1:]):
-                trunk = None if job.trunk is None else before.get(job.trunk)
-                shared += 0.0 if job.done or trunk is None else job.begins(trunk)
-                before[job.out] = job
-            done = sum(job.done for job in before.values())
-            counts.append(SweepCount(name, len(before), done, shared))
+            found = {job.out: job for job in jobs_of_sweep(with_fixed_keys(["-m", *_sweep(name), *overrides])[1:])}
+            folders = {job.out.parent for job in found.values()} | ({said.measured} if said.measured else set())
+            runs = measured_runs(folder for folder in folders if folder.is_dir())
+            counts.append(_count(name, list(found.values()), runs, said))
     return counts
 
 
-@dataclass(frozen=True)
-class _Job:
-    out: Path
-    prefix: tuple[object, ...]
-    """What it trains before anything is pruned: what is the same on other drives and seeds, the log, the seed; empty
-    where it follows from a run that is not there yet."""
-    trunk: Path | None
-    """The folder of the run that it would begin with."""
-    first: float
-    """The fraction of it at which something is pruned first."""
-    keeps: tuple[float, ...]
-    """The moments before which it leaves a checkpoint."""
-    done: bool
-    """Whether it stands finished in its folder."""
-
-    def begins(self, trunk: "_Job") -> float:
-        """Return the fraction of the run at which it begins."""
-        kept = trunk.keeps if trunk.prefix == self.prefix != () else ()
-        return max((moment for moment in kept if moment <= self.first < math.inf), default=0.0)
-
-
-class JobComposer:
-    """Composes jobs. Of those that differ in seed and drive alone the first is composed, the others put theirs in."""
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[str, ...], tuple[DictConfig, _Job]] = {}
-
-    def job(self, words: Sequence[str], number: int) -> _Job:
-        """Return the job of such overrides. Raises what Hydra raises for options that do not compose."""
-        key = tuple(word for word in words if not word.startswith(ALIKE))
-        if key in self._known and (job := self._like(*self._known[key], words, number)) is not None:
-            return job
-        cfg = compose("train", [*words, "folder=.", f"hydra.job.num={number}"], return_hydra_config=True)
-        whole, out = cfg.copy(), Path(cfg.hydra.sweep.dir, cfg.hydra.sweep.subdir)
-        with open_dict(cfg):
-            del cfg["hydra"]
-        cfg.folder = str(out)
-        job = _job(cfg, out, done=out.is_dir() and finished(cfg, out) is not None)
-        if job.prefix:
-            self._known[key] = whole, job
-        return job
-
-    def _like(self, cfg: DictConfig, other: _Job, words: Sequence[str], number: int) -> _Job | None:
-        """Return the job of a configuration with another seed and drive; None where its folder has to be looked at, or
-        what it reads follows from files that are not there."""
-        own = [OverridesParser.create().parse_override(word) for word in words if word.startswith(ALIKE)]
-        for override in own:
-            OmegaConf.update(cfg, override.key_or_group, override.value())
-        cfg.hydra.job.num = number
-        out = Path(cfg.hydra.sweep.dir, cfg.hydra.sweep.subdir)
-        cfg.folder = str(out)
-        try:
-            read = OmegaConf.to_container(cfg.data.log, resolve=True)
-        except (OmegaConfBaseException, ValueError):
-            return None
-        if out.is_dir():
-            return None
-        trunk = Path(os.path.normpath(cfg.trunk)) if cfg.trunk else None
-        prefix = (other.prefix[0], str(read), cfg.seed)
-        return replace(other, out=Path(os.path.normpath(out)), prefix=prefix, trunk=trunk, done=False)
+def _count(name: str, jobs: Sequence[Job], runs: Sequence[MeasuredRun], said: Assumptions) -> SweepCount:
+    """Return the count of a sweep with what its jobs cost."""
+    before: dict[Path, Job] = {}
+    shares, sources = {}, Counter()
+    costs: dict[str, dict[Path, float | None]] = {quantity: {} for quantity in QUANTITIES}
+    for job in jobs:
+        trunk = None if job.trunk is None else before.get(job.trunk)
+        before[job.out] = job
+        if job.done:
+            continue
+        shares[job.out] = 0.0 if trunk is None else job.begins(trunk)
+        for quantity, cost in cost_of(job.kind, 1 - shares[job.out], runs, said).items():
+            costs[quantity][job.out] = cost.value
+            sources[quantity, cost.source] += 1
+    hours = costs["hours"]
+    shards = [_total(hours.get(job.out, 0.0) for job in shard) for shard in dealt(jobs, said.devices)]
+    return SweepCount(
+        name,
+        len(jobs),
+        sum(job.done for job in jobs),
+        sum(shares.values()),
+        hours=_total(hours.values()),
+        longest=_largest(shards),
+        memory=_largest(costs["memory"].values()),
+        disk=_total(costs["disk"].values()),
+        sources=sources,
+    )
 
 
-def _jobs_of(overrides: Sequence[str]) -> Iterator[_Job]:
-    words_of_jobs, composer = list(jobs_of(overrides)), JobComposer()
-    said = time.monotonic()
-    for number, words in enumerate(words_of_jobs):
-        if time.monotonic() - said > _EVERY:
-            said = time.monotonic()
-            print(f"{number} of {len(words_of_jobs)} jobs looked at", file=sys.stderr, flush=True)
-        yield composer.job(words, number)
+def _total(values: Iterable[float | None]) -> float | None:
+    known = list(values)
+    return None if None in known else sum((value for value in known if value is not None), 0.0)
 
 
-def _job(cfg: DictConfig, out: Path, done: bool) -> _Job:
-    try:
-        config = flat_config(resolved(cfg))
-        read, first = str(OmegaConf.to_container(cfg.data.log, resolve=True)), first_pruning(config)
-    except (OmegaConfBaseException, ValueError):
-        return _Job(out, (), None, 0.0, (), done)
-    trunk = Path(os.path.normpath(cfg.trunk)) if cfg.trunk else None
-    alike = identity_of_trunk({key: value for key, value in config.items() if not key.startswith(_OF_DRIVE)})
-    return _Job(Path(os.path.normpath(out)), (alike, read, cfg.seed), trunk, first, moments_to_keep(cfg), done)
+def _largest(values: Iterable[float | None]) -> float | None:
+    known = list(values)
+    return None if None in known else max((value for value in known if value is not None), default=0.0)
 
 
-def _table(counts: Sequence[SweepCount]) -> Table:
-    table = Table("sweep", box=None)
-    for heading in ("jobs", "finished", "to train", "in whole runs"):
-        table.add_column(heading, justify="right")
-    parts = ("jobs", "finished", "shared")
-    total = SweepCount("sum", *(sum(getattr(one, part) for one in counts) for part in parts))
-    for one in [*counts, total] if len(counts) > 1 else counts:
+def _sum(counts: Sequence[SweepCount]) -> SweepCount:
+    """Return the count of sweeps that are trained one after the other."""
+    return SweepCount(
+        "sum",
+        *(sum(getattr(one, part) for one in counts) for part in ("jobs", "finished", "shared")),
+        hours=_total(one.hours for one in counts),
+        longest=_total(one.longest for one in counts),
+        memory=_largest(one.memory for one in counts),
+        disk=_total(one.disk for one in counts),
+    )
+
+
+def _table(counts: Sequence[SweepCount], devices: int) -> Table:
+    table = Table(box=None, pad_edge=False)
+    table.add_column("sweep", no_wrap=True)
+    shards = [f"on {devices}\ndevices"] if devices > 1 else []
+    for heading in ("jobs", "finished", "to\ntrain", "whole\nruns", "hours", *shards, "GB of\nmemory", "GB on\ndisk"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for one in [*counts, _sum(counts)] if len(counts) > 1 else counts:
         numbers = map(str, (one.jobs, one.finished, one.trainings))
-        table.add_row(one.name, *numbers, f"{one.whole_runs:.1f}")
+        hours = [one.hours, *([one.longest] if shards else ())]
+        costs = [*hours, *(None if value is None else value / 1e9 for value in (one.memory, one.disk))]
+        table.add_row(one.name, *numbers, f"{one.whole_runs:.1f}", *map(_cell, costs))
     return table
+
+
+def _cell(value: float | None) -> str:
+    """Return a number in three digits; "-" for one that is not known."""
+    return "-" if value is None else f"{value:,.0f}" if value >= 99.95 else f"{value:.3g}"
+
+
+def _sources(counts: Sequence[SweepCount]) -> list[str]:
+    """Return a line for each source, with the quantities and the number of jobs that it speaks for."""
+    found = sum((one.sources for one in counts), Counter())
+    quantities: defaultdict[tuple[str, int], list[str]] = defaultdict(list)
+    for (quantity, source), number in sorted(found.items(), key=lambda item: QUANTITIES.index(item[0][0])):
+        quantities[source, number].append(quantity)
+    return [f"{', '.join(names)} of {_jobs(number)}: {source}" for (source, number), names in quantities.items()]
+
+
+def _jobs(count: int) -> str:
+    return f"{count} job" if count == 1 else f"{count} jobs"

@@ -18,6 +18,7 @@ from sparsestreet.cli.config.log_from_options import with_found_data
 from sparsestreet.cli.config.validate import flag_problem, override_problem, with_effect_keys
 from sparsestreet.cli.process import is_worker_rank, name_beside_first, set_log_prefix
 from sparsestreet.cli.runs.folder import check_resumed, folder_problem, leave_folder, resumed_overrides
+from sparsestreet.cli.runs.jobs import give_back_trunks, jobs_of_shard, shard_problem, without_shard, words_of_job
 from sparsestreet.cli.runs.locks import sole_writer
 from sparsestreet.cli.runs.sweep import (
     SweepFolder,
@@ -45,9 +46,11 @@ def train(arguments: list[str]) -> int:
     """
     global _started
     _started = time.perf_counter()
+    shard = None
     if "--help" not in arguments:
         try:
             parts, arguments = _without_parts(arguments)
+            shard, arguments = without_shard(arguments)
             problem = flag_problem(arguments)
             if problem is None:
                 arguments = as_sweep(as_typed(arguments))
@@ -55,7 +58,7 @@ def train(arguments: list[str]) -> int:
                 if found:
                     print(f"sparsestreet train: {found}", file=sys.stderr)
                 problem = sweep_problem(arguments) or override_problem(arguments) or _problem_of_values(arguments)
-                problem = problem or job_problem(arguments)
+                problem = problem or shard_problem(shard, arguments) or job_problem(arguments)
                 arguments = _shown(with_fixed_keys(arguments))
         except (FileNotFoundError, ValueError) as error:
             problem = str(error)
@@ -64,15 +67,18 @@ def train(arguments: list[str]) -> int:
             return 2
         if note := note_of_sweep(arguments):
             print(f"sparsestreet train: {note}", file=sys.stderr)
-    sys.argv = [sys.argv[0], *arguments]  # which Hydra reads
     SweepFolder.folder = None  # of an earlier command of this process
+    own = None if shard is None else jobs_of_shard(shard, arguments)
     try:
-        with restored_handlers():
-            app()
+        for words in [arguments] if own is None else (words_of_job(job) for job in own):
+            sys.argv = [sys.argv[0], *words]  # which Hydra reads
+            with restored_handlers():
+                app()
     except KeyboardInterrupt:
         print("sparsestreet train: stopped; the same command goes on from the newest checkpoints", file=sys.stderr)
         return 128 + signal.SIGINT
-    return sweep_status()
+    give_back_trunks(arguments, own)
+    return sweep_status(None if own is None else {job.out for job in own})
 
 
 def _without_parts(arguments: list[str]) -> tuple[list[str], list[str]]:

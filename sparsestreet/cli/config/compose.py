@@ -104,6 +104,7 @@ class TrainSchema:
     trunk: str | None = None
     checkpoint_every: Any = MISSING
     branch_points: list[float] = field(default_factory=list)
+    keep_checkpoints: bool = False
     count_of: str | None = None
     cache: str | None = None
     data: Tree = MISSING

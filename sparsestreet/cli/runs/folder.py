@@ -54,6 +54,11 @@ def resumed_overrides(arguments: list[str], parts: Sequence[str] = ()) -> list[s
         raise ValueError("a sweep cannot go on with one run: leave out -m or resume")
     run = run_of(Path(given))
     load_run_config(run)  # says what a run's folder is, where this is none
+    if is_whole(run) and Path(given).is_dir() and not (run / "checkpoints" / "last.ckpt").is_file():
+        raise FileNotFoundError(
+            f"resume={given}: it is finished and gave its checkpoint back: sparsestreet evaluate run={run} measures it "
+            "again; to go on from a finished run, train it with keep_checkpoints=true"
+        )
     if not has_checkpoint(run):
         raise FileNotFoundError(
             f"resume={given}: it was ended before its first checkpoint (checkpoint_every=...): start it again with "
@@ -322,6 +327,37 @@ def leave_folder(out: Path, log: str) -> None:
     """
     if out.is_dir() and not out.is_symlink() and {path.name for path in out.iterdir()} <= {CONFIGURATION, log}:
         shutil.rmtree(out)
+
+
+def give_back(cfg: DictConfig, out: Path, *, of_sweep: bool) -> None:
+    """Remove the checkpoints of a finished run that no run needs, and say how large they were.
+
+    The last one always goes. Those of ``branch_points`` stay where they were asked for by hand, and in a sweep with its
+    trunk, until ``give_back_trunk``. A run that is not finished, or has ``keep_checkpoints``, keeps all.
+    """
+    if cfg.keep_checkpoints or not is_whole(out):
+        return
+    trunk = bool(cfg.trunk) and os.path.abspath(cfg.trunk) == os.path.abspath(out)
+    _remove(out, [path for path in _checkpoints(out) if checkpoint_fraction(path) is None or (of_sweep and not trunk)])
+
+
+def give_back_trunk(out: Path) -> None:
+    """Remove what branches began with, once all of them stand finished."""
+    _remove(out, [path for path in _checkpoints(out) if checkpoint_fraction(path) is not None])
+
+
+def _checkpoints(out: Path) -> list[Path]:
+    return sorted((out / "checkpoints").glob("[!.]*.ckpt"))
+
+
+def _remove(out: Path, checkpoints: Sequence[Path]) -> None:
+    check_links(out)
+    size = sum(path.stat().st_size for path in checkpoints)
+    for path in checkpoints:
+        path.unlink(missing_ok=True)
+    if checkpoints:
+        log.info("%s is finished and gave %.1f MB of checkpoints back: it can be measured again, not trained on "
+                 "(keep_checkpoints=true)", out, size / 1e6)  # fmt: skip
 
 
 def _description(out: Path) -> RunDescription | None:

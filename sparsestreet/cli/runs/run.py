@@ -10,6 +10,7 @@ from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from lightning import Callback, Trainer
 from omegaconf import DictConfig
@@ -18,7 +19,15 @@ from sparsestreet.cli.config.compose import check_moved, configuration, resolved
 from sparsestreet.cli.config.log_from_options import reader_of
 from sparsestreet.cli.config.validate import config_problem, preset_notes
 from sparsestreet.cli.process import is_worker_rank, keep_freed_memory
-from sparsestreet.cli.runs.folder import lies_in, moments_to_keep, run_of, start_from_trunk, start_of, take_folder
+from sparsestreet.cli.runs.folder import (
+    give_back,
+    lies_in,
+    moments_to_keep,
+    run_of,
+    start_from_trunk,
+    start_of,
+    take_folder,
+)
 from sparsestreet.cli.runs.locks import devices_of_job
 from sparsestreet.cli.runs.tracks import finds, with_tracks, write_tracks
 from sparsestreet.data.datamodule import StreetData
@@ -174,7 +183,10 @@ def run(cfg: DictConfig, out: Path, started: float) -> float | None:
             checkpoints_before=moments_to_keep(cfg),
             stages=stages,
         )
-    return 0.0 if summary is None else summary.mean("psnr_full")
+    if summary is None:
+        return 0.0
+    give_back(cfg, out, of_sweep=HydraConfig.get().mode == RunMode.MULTIRUN)
+    return summary.mean("psnr_full")
 
 
 def _window_of(cfg: DictConfig, data: StreetData) -> str:

@@ -2,10 +2,11 @@
 
 import logging
 import math
+import re
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -23,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 from sparsestreet.cli.config.compose import configuration, is_sweep, resolved, value_of, without_flags
 from sparsestreet.cli.config.resolvers import UNCOUNTED
 from sparsestreet.cli.config.validate import SHOWS, SWEEPS, flags_of
-from sparsestreet.cli.runs.folder import folder_problem, holds_same_run, is_whole, same_run
+from sparsestreet.cli.runs.folder import folder_problem, give_back, holds_same_run, is_whole, same_run
 from sparsestreet.cli.runs.locks import FolderTakenError
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.records.run import FAILURE, FailedRun, read_failures
@@ -37,8 +38,8 @@ ALIKE = ("seed=", "data.root=")
 """Options of a job that no problem of its configuration depends on."""
 _SAID = 10
 """Configurations from which on a sweep says that it looks at them: a second each."""
-_OTHER_SWEEPERS = ("hydra/sweeper=", "hydra.sweeper.")
-"""Sweepers of somebody else's choose their jobs as they go."""
+_OTHER_SWEEPERS = re.compile(r"hydra/sweeper=|hydra\.sweeper\.(?!max_batch_size=)")
+"""Words of sweepers of somebody else's, which choose their jobs as they go."""
 OF_DRIVES = ("table", "drives")
 """What the names of sweeps over recorded drives start with."""
 
@@ -98,12 +99,17 @@ def jobs_of(overrides: Sequence[str]) -> Iterator[list[str]]:
         yield from batch
 
 
+def has_known_jobs(arguments: list[str]) -> bool:
+    """Whether this is a sweep whose jobs are known before the first is trained."""
+    return bool(SWEEPS & flags_of(arguments)) and not any(map(_OTHER_SWEEPERS.search, arguments))
+
+
 def job_problem(arguments: list[str]) -> str | None:
     """The first job of a sweep that cannot be, in one sentence; None where each can.
 
     Each configuration is looked at once, whatever its seeds. What follows from a run that is not there yet passes.
     """
-    if not SWEEPS & flags_of(arguments) or any(key in text for text in arguments for key in _OTHER_SWEEPERS):
+    if not has_known_jobs(arguments):
         return None
     from sparsestreet.cli.config.validate import config_problem
     from sparsestreet.cli.runs.run import recipe_of
@@ -155,11 +161,11 @@ def sweep_problem(arguments: list[str]) -> str | None:
     return None
 
 
-def sweep_status() -> int:
-    """0, or 1 with a line on standard error where a job of this process's sweep failed."""
+def sweep_status(own: Collection[Path] | None = None) -> int:
+    """0, or 1 with a line on standard error where a job of this process's sweep failed; ``own``: only these folders."""
     if SweepFolder.folder is None:
         return 0
-    failures = read_failures(SweepFolder.folder)
+    failures = [one for one in read_failures(SweepFolder.folder) if own is None or one[0] in own]
     for folder, failure in failures:
         print(f"sparsestreet train: {folder} failed: {failure.error}", file=sys.stderr)
     if failures:
@@ -185,6 +191,7 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> fl
             done = train()
         else:
             log.info("%s holds a complete record of this configuration: skipped", out)
+            give_back(cfg, out, of_sweep=True)  # which a kill may have kept it from
     except FolderTakenError as error:
         log.error("%s", error)  # a word in that folder would speak of the run that is under way
         return math.nan
