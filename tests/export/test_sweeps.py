@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -44,7 +45,7 @@ def lidar_at(frame: float, mount: tuple[float, float, float] = (1.0, 0.0, 1.9), 
     return pose
 
 
-def drawn(model: LidarModel, frame: int, **more: float) -> Returns:
+def drawn(model: LidarModel, frame: int, **more: Any) -> Returns:
     """The turn around a frame of the log; before the first frame and after the last the car stands."""
     stored = stored_street()
 

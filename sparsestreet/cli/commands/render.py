@@ -303,7 +303,9 @@ def _known_mount(rig: "Rig", place: Sequence[float] | None) -> tuple[float, ...]
     if place is not None:
         *world, instant = place
         mount = tuple((np.linalg.inv(rig.at(instant)) @ [*world, 1.0])[:3].tolist())
-    said = ", ".join(f"{one:.2f} m {where}" for one, where in zip(mount, ("ahead", "left", "up"), strict=True))
+    said = ", ".join(
+        f"{round(one, 2) + 0.0:.2f} m {where}" for one, where in zip(mount, ("ahead", "left", "up"), strict=True)
+    )
     whose = "as roofs carry one" if place is None else "as the log's"
     print(f"the lidar is {said} of the car's origin, {whose} (mount=...)")
     return mount
