@@ -43,7 +43,7 @@ def test_objects_stand_where_they_were_once_their_poses_are_applied(tmp_path: Pa
         corners = np.stack([hull["vertex"][axis] for axis in "xyz"], 1)
         assert np.abs(corners).max() <= 0.5  # half of the box
         assert len(hull["face"]) == 2 * len(corners) - 4  # closed
-        assert one["hull_is_box"] == (len(corners) == 8 and np.allclose(np.abs(corners), 0.5))
+        assert not one["hull_is_box"]
     for one in said["objects"]:
         for time in (0.0, 0.5):
             found, expected = placed(folder, one, time), scene_gaussians(stored, time, instances=[one["name"]])

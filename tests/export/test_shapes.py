@@ -18,7 +18,7 @@ from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.state import FINISHED
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
-from tests.export.street import stored_street, street_views
+from tests.export.street import CAR_ROWS, stored_street, street_views
 from tests.scene.people import smpl, walker
 from tests.scene.street import random_rows, rigid
 
@@ -105,6 +105,9 @@ def test_an_obj_has_what_is_there_where_it_is(tmp_path):
     for name, center in ("car", [9.0, 0.5, 1.0]), ("tram", [9.0, 0.0, 1.0]):
         assert (np.abs(found[name].vertices - center) <= 0.5001).all()
     assert write_shapes(tmp_path / "b.obj", stored, views, 1.0).hulls[:1] == ("car",)
+    with torch.no_grad():
+        stored.scene.nodes["rigid"].rows.opacity_logits[:CAR_ROWS] = -3.0
+    assert write_shapes(tmp_path / "b.obj", stored, views, 0.25).boxes == ("car",)
     turned = StoredScene(SceneGraph({"block": block()}), RenderOptions(), "x", 5)
     write_shapes(tmp_path / "c.obj", turned, views, 0.0)
     (mesh,) = read_obj(tmp_path / "c.obj").values()
