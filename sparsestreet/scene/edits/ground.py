@@ -106,7 +106,7 @@ class Ground:
     def grid(self) -> tuple[Float64[np.ndarray, "2"], Float64[np.ndarray, "x y"], Bool[np.ndarray, "x y"]]:
         """Return x and y of the first node of a grid around all feet, heights (NaN: nothing tells), and what is near.
 
-        Gaussians within a meter tell; where there are none within two meters of a camera, a plane through the road
+        Gaussians within two meters tell; where there are none as near to a camera, a plane through the road
         around.
         """
         feet = self._feet
@@ -123,7 +123,7 @@ class Ground:
         heights = np.full(len(places), np.nan)
         for node in np.flatnonzero(away < REACH):
             stands, play = feet[nearest[node], 2], _PLAY + _RISE * away[node]
-            found = self._layer(places[node, 0], places[node, 1], stands - play, stands + play, _RADII[:1])
+            found = self._layer(places[node, 0], places[node, 1], stands - play, stands + play, _RADII[:2])
             heights[node] = np.nan if found is None else found
         told = np.column_stack([places, heights])[np.isfinite(heights)]
         driven, _ = KDTree(self._road[:, :2]).query(places)

@@ -20,8 +20,8 @@ AHEAD, LEFT = np.array([math.cos(0.6), math.sin(0.6)]), np.array([-math.sin(0.6)
 START = np.array([310.0, -170.0])
 SLOPE = np.array([0.04, -0.07])
 """Of x and y of the world."""
-HOLE, DEEP = (12.0, 4.5), (24.0, -5.4)
-"""Meters ahead and to the left of the start, without Gaussians within 1.3 m and within 3 m."""
+HOLE, DEEP = (12.0, 4.5), (24.0, -6.4)
+"""Meters ahead and to the left of the start, without Gaussians within 2.1 m and within 4 m."""
 
 
 def height(places: np.ndarray) -> np.ndarray:
@@ -53,7 +53,7 @@ def street() -> SceneGraph:
     """A road 16 m wide and 40 m long that begins 3 m ahead, leaves above it, a deck 0.6 m higher beside it."""
     generator = np.random.default_rng(5)
     road = generator.uniform([3.0, -8.0], [40.0, 8.0], (9000, 2))
-    for hole, radius in ((HOLE, 1.35), (DEEP, 3.0)):
+    for hole, radius in ((HOLE, 2.15), (DEEP, 4.0)):
         road = road[np.linalg.norm(road - hole, axis=1) > radius]
     deck = generator.uniform([3.0, 9.0], [40.0, 14.0], (4000, 2))
     road, deck = at(road[:, 0], 0.0) + np.outer(road[:, 1], LEFT), at(deck[:, 0], 0.0) + np.outer(deck[:, 1], LEFT)
@@ -90,12 +90,13 @@ def test_the_mesh_is_the_road(found):
     errors = np.abs(heights - height(places))
     ahead, left = along(places)
     inside = (ahead > 4) & (ahead < 38) & (np.abs(left) < 7)
-    area = 34 * 14 - np.pi * 3**2
-    assert inside.sum() * SPACING**2 == pytest.approx(area, rel=0.08)
+    area = 34 * 14 - 8.6  # what is left of the second hole 2 m from its edge
+    assert inside.sum() * SPACING**2 == pytest.approx(area, rel=0.02)
     assert np.median(errors[inside]) < 0.01
-    assert errors[inside].max() < 0.06
+    whole = inside & (np.hypot(ahead - HOLE[0], left - HOLE[1]) > 3) & (np.hypot(ahead - DEEP[0], left - DEEP[1]) > 5)
+    assert errors[whole].max() < 0.06
     # Beside the last Gaussians, the height is that of half a circle.
-    assert errors.max() < 0.15
+    assert errors.max() < 0.2
     assert left.max() < 9.2
     assert (np.diff(np.sort(np.unique(places[:, 0]))) == SPACING).all()
 
@@ -105,7 +106,7 @@ def test_a_hole_is_filled_where_what_is_around_agrees(found):
     away = [np.hypot(ahead - hole[0], left - hole[1]) for hole in (HOLE, DEEP)]
     assert away[0].min() < 0.4
     assert 1.7 < away[1].min() < 2.7
-    assert found.filled >= 2
+    assert found.filled >= 1
     near = REACH * 2 * 36 + np.pi * REACH**2
     assert found.left_out == pytest.approx(near / SPACING**2 - len(found.mesh.vertices), rel=0.05)
 
@@ -117,7 +118,7 @@ def test_where_a_camera_was_driven_the_road_is_as_far_below_it_as_elsewhere(foun
     first = (ahead < 1) & (np.abs(left) < 1)
     assert first.sum() > 10
     assert ahead.min() > -2.2
-    assert np.abs(found.mesh.vertices[first, 2] - height(places[first])).max() < 0.05
+    assert np.abs(found.mesh.vertices[first, 2] - height(places[first])).max() < 0.03
 
 
 def test_a_street_without_a_drive_or_feet_has_no_ground():
