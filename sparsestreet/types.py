@@ -233,6 +233,10 @@ class View:
 MASK_KINDS = ("sky", "human", "vehicle", "ego")
 """Fields of a frame that are masks."""
 
+MaskSource = Literal["fine", "coarse", "given", "shipped", "true"]
+"""Whose masks a log has: "fine" and "coarse" as DriveStudio's folders are called, "given" by the user, "shipped" by the
+data set itself, "true" of a synthetic street. Numbers of people and vehicles compare within one source alone."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Frame(View):

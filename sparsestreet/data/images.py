@@ -23,7 +23,7 @@ from torch import Tensor
 from sparsestreet.atomic import check_regular
 from sparsestreet.data.problems import LogError, Problem, attempt, fault, missing_files
 from sparsestreet.data.rig import Undistortion
-from sparsestreet.types import MASK_KINDS
+from sparsestreet.types import MASK_KINDS, MaskSource
 
 logger = logging.getLogger(__name__)
 
@@ -412,6 +412,10 @@ class GivenMasks:
     def kinds(self) -> frozenset[str]:
         root = self.root
         return frozenset(() if root is None else (kind for kind in MASK_KINDS if (root / kind).is_dir()))
+
+    def beside(self, shipped: Iterable[str]) -> dict[str, MaskSource]:
+        """Return kind -> whose masks they are; ``shipped``: kinds of the data set itself, which given ones replace."""
+        return {**dict.fromkeys(shipped, "shipped"), **dict.fromkeys(self.kinds, "given")}
 
     def paths(self, camera: str, stem: str) -> dict[str, Path]:
         """Kind -> the file of an image, for the kinds that its camera has."""

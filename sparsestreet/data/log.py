@@ -15,7 +15,7 @@ from sparsestreet.data.lazy import Frames, Sweeps, as_frames
 from sparsestreet.data.tracks import repeated
 from sparsestreet.geometry.trajectories import frame_periods
 from sparsestreet.kept import NOTHING, Kept
-from sparsestreet.types import Frame, SparsePoints, Track, View
+from sparsestreet.types import Frame, MaskSource, SparsePoints, Track, View
 
 _ABSENT = {
     "sky": "no sky masks: nothing but the images tells sky from scene, and there is no sky term in the loss",
@@ -105,6 +105,8 @@ class DrivingLog:
     """Makes frames and sweeps whose points these objects carry from one time to another; those of instants that are not
     held out depend on no box of one that is. None: no box carries a point."""
 
+    masks: Mapping[str, MaskSource] | None = None
+    """Kind of masks (``MASK_KINDS``) that the log has -> whose they are; None: the reader does not tell."""
     is_annotated: bool = True
     """Whether somebody has looked for objects in it, though there may be none."""
     vehicle: VehiclePath | None = None

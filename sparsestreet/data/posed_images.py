@@ -180,7 +180,7 @@ class PosedReader(RecordedReader):
             shots=shots,
             read_image=pixels.image,
             read_masks=partial(_masks, pixels),
-            mask_kinds=self.given.kinds.union({"ego"} if has_own else ()),
+            mask_kinds=self.given.beside(["ego"] if has_own else ()),
             sparse_points=None if table.points is None else partial(self._scaled_points, table.points),
             points_file=table.points,
             notes=(_note_of_scale(shots, self.scale), *table.notes),

@@ -7,7 +7,7 @@ depth images and colors of returns are the same for all data sets, and are done 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache, partial
 from itertools import chain, pairwise
 from pathlib import Path
@@ -37,7 +37,7 @@ from sparsestreet.data.timestamps import LogClock
 from sparsestreet.data.tracks import checked_track, repeated, timed_tracks, track_in_window
 from sparsestreet.geometry.boxes import CarriedPoints, without_frames
 from sparsestreet.geometry.cameras import inverse, transform_points
-from sparsestreet.types import MASK_KINDS, Frame, SparsePoints, Sweep, Track, View
+from sparsestreet.types import MASK_KINDS, Frame, MaskSource, SparsePoints, Sweep, Track, View
 
 T = TypeVar("T")
 
@@ -215,8 +215,8 @@ class Recording:
     """At the size of the rig's camera. Raises LogError for a broken file."""
     read_masks: Callable[[RecordedImage], Mapping[str, Bool[Tensor, "h w"]]]
     """Those of MASK_KINDS that the image has."""
-    mask_kinds: frozenset[str] = frozenset()
-    """Which kinds the log has at all."""
+    mask_kinds: Mapping[str, MaskSource] = field(default_factory=dict)
+    """Kind that the log has at all -> whose masks they are."""
     frame_stamps: tuple[int, ...] | None = None
     """Stamp of each instant; None: the data set has no clock."""
     sweeps: Mapping[int, LidarSweep] | None = None
@@ -411,6 +411,7 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
         carried_by=folder.carried_by,
         sparse_points=None if recording.sparse_points is None else cache(partial(_sparse_points, recording, origin)),
         is_annotated=recording.boxes is not None,
+        masks=recording.mask_kinds,
         vehicle=_vehicle(recording.vehicle, origin),
         notes=(
             *_absent(recording),

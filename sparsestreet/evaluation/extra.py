@@ -1,4 +1,4 @@
-"""What is measured of a finished scene where somebody asks: beside the recorded path, and rendered in other ways."""
+"""What is measured of a finished scene where somebody asks: beside the path, rendered in other ways, times alone."""
 
 import math
 import statistics
@@ -16,10 +16,11 @@ from sparsestreet.data.frame_cache import to_device
 from sparsestreet.data.lazy import Frames
 from sparsestreet.data.log import Truth
 from sparsestreet.evaluation.evaluate import frame_quality, quantized, restored, screen_image
-from sparsestreet.evaluation.speed import Timing, device_name, frame_image
+from sparsestreet.evaluation.speed import Timing, device_name, frame_image, measure_latency, measure_scene_costs
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.metrics.definitions import metric_id
-from sparsestreet.metrics.distances import Extractor, LastLayer
+from sparsestreet.metrics.distances import Extractor, LastLayer, distance_names
+from sparsestreet.metrics.fid import open_inception
 from sparsestreet.metrics.image import psnr
 from sparsestreet.metrics.lpips import Lpips, open_lpips
 from sparsestreet.metrics.reported import PerceptualDistance, Psnr, SetDistances, reported_metrics
@@ -27,14 +28,22 @@ from sparsestreet.noise import calibrate, noise_between
 from sparsestreet.ops import SplatSettings
 from sparsestreet.ops.settings import OWN_PRESETS
 from sparsestreet.phases import clock_of, stage
+from sparsestreet.records.costs import COSTS, update_costs
+from sparsestreet.records.file import check_links
+from sparsestreet.records.run import this_machine, this_source
 from sparsestreet.records.summary import (
+    LATENCY,
     NOVEL,
     PRESETS,
+    SUMMARY,
+    Evaluation,
     FrameQuality,
     NovelRecord,
     NovelShift,
     PresetRecord,
     RenderedAs,
+    RunSummary,
+    clock_rows,
     summarize,
 )
 from sparsestreet.scene.graph import SceneGraph
@@ -52,9 +61,9 @@ def evaluate_novel(
     *,
     command: str,
     truth: Truth | None,
-    extractor: Extractor | None,
+    extractors: Sequence[Extractor],
     lpips: Lpips | None = None,
-    absent: str = "",
+    missing: Mapping[str, str] | None = None,
     ramp: bool = False,
 ) -> NovelRecord:
     """Shift recorded views by each offset to both sides, and compare.
@@ -66,34 +75,36 @@ def evaluate_novel(
         options: how the scene is rendered.
         command: that asked for it.
         truth: what a view would have recorded; None: nobody knows.
-        extractor: of the features that distances compare; None: no distances.
+        extractors: of the features that distances compare; empty: no distances.
         lpips: compares renders with true images; None: PSNR alone does.
-        absent: why there is no extractor.
+        missing: distance -> why there is no extractor for it, and what to do about it.
         ramp: as in ``NovelRecord``.
 
     Raises ValueError without views, for offsets that are not above 0, or for renders that are not finite.
     """
     if not frames or not offsets or not min(offsets) > 0:
         raise ValueError(f"novel views need recorded ones and offsets above 0 m, got {len(frames)} and {list(offsets)}")
+    missing = dict(missing or {})
     if len(frames) < 2:
-        extractor, absent = None, "distances need at least two images: hold out more views"
+        known = [*missing, *(name for one in extractors for name in distance_names(one.name))]
+        extractors, missing = (), dict.fromkeys(known, "distances need at least two images: hold out more views")
     scene, device = StandingScene.of(scene), scene.device
     # One process measures: the others wait for nobody.
-    distances = None if extractor is None else SetDistances(extractor, sync_on_compute=False)
+    distances = [SetDistances(extractor, sync_on_compute=False) for extractor in extractors]
     quality = Psnr(("full", "human", "vehicle"), sync_on_compute=False)
     perceptual = None if lpips is None else PerceptualDistance(lpips, sync_on_compute=False)
-    metrics = [metric for metric in (quality, perceptual, distances) if metric is not None]
-    if distances is not None:
-        for frame in frames:
-            distances.update(frame.image.to(device).float() / 255, real=True)
+    metrics = [quality, *([] if perceptual is None else [perceptual]), *distances]
+    for frame in frames if distances else ():
+        for distance in distances:
+            distance.update(frame.image.to(device).float() / 255, real=True)
 
     def shift(offset: float) -> NovelShift:
         views = shifted_views(frames.views, offset, ramp)
         true_views, numbers = 0, {}
         for view in views:
             image = screen_image(scene, view, options)
-            if distances is not None:
-                distances.update(image, real=False)
+            for distance in distances:
+                distance.update(image, real=False)
             true = truth and truth(view)
             if true is not None:
                 true_views += 1
@@ -104,7 +115,7 @@ def evaluate_novel(
         found = NovelShift(
             offset=offset,
             views=len(views),
-            distances={} if distances is None else distances.compute(),
+            distances={name: value for distance in distances for name, value in distance.compute().items()},
             truth=numbers,
             true_views=true_views,
         )
@@ -117,7 +128,8 @@ def evaluate_novel(
         command=command,
         ramp=ramp,
         real_views=len(frames),
-        absent=None if extractor is not None else absent,
+        absent=None if extractors else "; ".join(dict.fromkeys(missing.values())),
+        missing=missing,
         shifts=shifts,
     )
 
@@ -249,6 +261,8 @@ class ExtraMetrics:
     """Whether the shift grows over the drive, as in a change of lane."""
     presets: Sequence[str] = ()
     """Ways to render, names of ``render.preset``."""
+    training_lpips: bool = False
+    """Whether training views get LPIPS too where views are held out, which takes seconds an image on a CPU."""
     timing: Timing = field(default_factory=Timing)
     """How often the frames of the record are timed."""
 
@@ -290,8 +304,11 @@ class ExtraMetrics:
     def _beside(
         self, scene: SceneGraph, views: Frames, options: RenderOptions, truth: Truth | None, command: str
     ) -> NovelRecord:
-        lpips, missing = open_lpips(scene.device)
+        lpips, without = open_lpips(scene.device)
+        inception, missing = open_inception(scene.device)
         network = lpips.get("lpips_alex")
+        if network is None:
+            missing |= dict.fromkeys(distance_names("alexnet"), without["lpips_alex"])
         return evaluate_novel(
             scene,
             views,
@@ -299,9 +316,12 @@ class ExtraMetrics:
             options,
             command=command,
             truth=truth,
-            extractor=None if network is None else LastLayer("alexnet", network),
+            extractors=[
+                *([] if inception is None else [inception]),
+                *([] if network is None else [LastLayer("alexnet", network)]),
+            ],
             lpips=network,
-            absent=missing.get("lpips_alex", ""),
+            missing=missing,
             ramp=self.ramp,
         )
 
@@ -313,8 +333,8 @@ def _of_shifts(record: NovelRecord) -> Iterator[str]:
         side = "right" if shift.offset > 0 else "left"
         what = ", ".join(said) or "nothing to compare with"
         yield f"{abs(shift.offset):g} m to the {side} (n={shift.views}): {what}"
-    if record.absent:
-        yield f"no distances: {record.absent}"
+    for reason in dict.fromkeys(record.missing.values()):
+        yield f"no {', '.join(name for name, why in record.missing.items() if why == reason)}: {reason}"
 
 
 def _drawing(preset: str, trained: SplatSettings) -> SplatSettings:
@@ -328,3 +348,31 @@ def _of_presets(record: PresetRecord) -> Iterator[str]:
             f"{one.preset}{' (as trained)' if one.trained else ''}: {one.quality['psnr_full']:.2f} dB, "
             f"{one.psnr_to_exact:.1f} dB to the exact image, {one.frame_ms:.1f} ms/frame"
         )
+
+
+def time_again(
+    run: Path, scene: SceneGraph, views: Sequence[View], options: RenderOptions, timing: Timing, *, command: str
+) -> RunSummary:
+    """Time the frames of a run that was measured, and renew what its records say of times; all else stays.
+
+    Args:
+        run: its folder.
+        scene: on the device where it is timed.
+        views: those of its main split.
+        options: how it is rendered.
+        timing: how often.
+        command: that asked for it.
+
+    Raises RecordError for a run without a summary, OSError for a link that leads out of its folder.
+    """
+    summary, scene = SUMMARY.read(run), StandingScene.of(scene.eval())
+    check_links(run)
+    latency = measure_latency(scene, views, options, warmup=timing.warmup, repeats=timing.repeats)
+    costs = measure_scene_costs(scene, views, options, repeats=timing.rounds)
+    LATENCY.write(run, clock_rows(latency))
+    if COSTS.exists(run):
+        update_costs(run, **vars(costs))
+    timed = Evaluation(command, this_machine(), this_source(), latency.device, latency.threads)
+    renewed = replace(summary, latency=latency, latency_protocol=latency.protocol, timed=timed)
+    SUMMARY.write(run, renewed)  # the last: it says that the others are renewed
+    return renewed

@@ -95,14 +95,14 @@ def evaluate_scene(
     device: torch.device | str,
     pictures: int = 4,
     timing: Timing | None = None,
+    training_lpips: bool = False,
     log: DrivingLog | None = None,
     ranks: Ranks = ALONE,
 ) -> RunSummary:
     """Measure quality, speed and size of a scene; write ``out/records``, ``out/predictions`` and ``out/pictures``.
 
     The numbers of held-out views are computed from the predictions as they are stored; those of training views from
-    renders rounded alike, without the perceptual distances where there are held-out views: these take seconds per
-    image on a CPU, and nobody reads them twice.
+    renders rounded alike, where there are held-out views without the perceptual distances unless they are asked for.
 
     Speed, guards and pictures are of the held-out views, or of the training views where none is held out.
 
@@ -117,6 +117,7 @@ def evaluate_scene(
         device: where it is rendered and timed.
         pictures: how many views become pictures.
         timing: how often frames are timed; None: ``Timing()``.
+        training_lpips: as in ``ExtraMetrics``.
         log: whose sweeps are compared with ranges of the scene; None: nothing is.
         ranks: the processes that measure quality together. This is the first; the others call ``help_to_evaluate``.
 
@@ -131,7 +132,7 @@ def evaluate_scene(
         Predictions.of(out, split).clear()
     for file in (NOVEL, PRESETS):
         file.remove(out)  # of an earlier evaluation, perhaps of an earlier scene
-    quality, gains, absent = _looks(scene, splits, options, out, ranks)
+    quality, gains, absent = _looks(scene, splits, options, out, ranks, training_lpips)
     timing = timing or Timing()
     with stage("latency"):
         latency = measure_latency(scene, frames.views, options, warmup=timing.warmup, repeats=timing.repeats)
@@ -168,12 +169,13 @@ def help_to_evaluate(
     out: Path,
     device: torch.device | str,
     ranks: Ranks,
+    training_lpips: bool = False,
 ) -> None:
     """A process's share of what the first one measures in ``evaluate_scene``; writes nothing. Ends before frames are
     timed, so that nobody else computes then. Raises as ``evaluate_scene``."""
     splits = _splits(held_out, training)
     if splits:
-        _looks(StandingScene.of(scene.to(torch.device(device)).eval()), splits, options, out, ranks)
+        _looks(StandingScene.of(scene.to(torch.device(device)).eval()), splits, options, out, ranks, training_lpips)
 
 
 def _splits(held_out: Frames | tuple[Frame, ...], training: Frames | tuple[Frame, ...]) -> dict[str, Frames]:
@@ -181,7 +183,12 @@ def _splits(held_out: Frames | tuple[Frame, ...], training: Frames | tuple[Frame
 
 
 def _looks(
-    scene: SceneGraph, splits: Mapping[str, Frames], options: RenderOptions, out: Path, ranks: Ranks
+    scene: SceneGraph,
+    splits: Mapping[str, Frames],
+    options: RenderOptions,
+    out: Path,
+    ranks: Ranks,
+    training_lpips: bool,
 ) -> tuple[dict[str, list[FrameQuality]], dict[str, EffectGain], Mapping[str, str]]:
     """Quality by split, gains of effects, and which distances could not be measured and why."""
     main, frames = next(iter(splits.items()))
@@ -193,7 +200,7 @@ def _looks(
                 views,
                 options,
                 Predictions.of(out, split) if split == HELD_OUT else None,
-                lpips if split == main else {},
+                lpips if split == main or training_lpips else {},
                 ranks,
             )
         )

@@ -132,7 +132,7 @@ class Lpips:
         values = ((2 * image.float() - 1 - shift) / scale).permute(2, 0, 1)[None]
         layers = zip(self.weights.kernels, self.weights.biases, strict=True)
         found = []
-        with _full_precision(image.device):
+        with full_precision(image.device):
             for stage in self.weights.stages:
                 values = functional.max_pool2d(values, stage.pool, stride=2) if stage.pool else values
                 for layer in stage.convolutions:
@@ -174,7 +174,7 @@ def _unit(features: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
     return features / (features.square().sum(0, keepdim=True).sqrt() + _TINY)
 
 
-def _full_precision(device: torch.device):
+def full_precision(device: torch.device):
     """Turn off TF32, in which cuDNN rounds the factors of convolutions to 10 bits."""
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False) if device.type == "cuda" else nullcontext()
 

@@ -107,6 +107,9 @@ class RunDescription:
     """``configuration.config_hash`` of ``config``; equal for repeats."""
     data_hash: str
     """``LogReader.data_hash``; equal for the same log in any folder."""
+    masks: dict[str, str] = field(default_factory=dict)
+    """Kind of masks ("sky", "human", "vehicle") -> whose they are (``types.MaskSource``), or "none"; empty: the record
+    is older, or the log does not tell."""
     command: str
     """The command that trained."""
     device: str

@@ -7,7 +7,7 @@ the former unchanged. Both are written whole or not at all.
 import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 
 from sparsestreet.metrics.definitions import DEFINITIONS, PSNR_CAP, REGIONS, metric_id, quantities_of
 from sparsestreet.records.file import CsvFile, JsonFile
@@ -279,6 +279,8 @@ class RunSummary:
     format: int = version(FORMAT, "evaluate again")
     run: RunDescription
     evaluated: Evaluation
+    timed: Evaluation | None = None
+    """The command, machine and code of ``latency``, where the frames were timed once more; None: those above."""
     images: dict[str, int]
     """Split ("held_out", "training") -> number of its evaluated images; a split without views is absent."""
     resolutions: tuple[str, ...]
@@ -324,10 +326,28 @@ class RunSummary:
         """The held-out split, or the training split of a run that holds out no views."""
         return HELD_OUT if HELD_OUT in self.quality else TRAINING
 
+    @property
+    def timing(self) -> Evaluation:
+        """The command, machine and code that timed the frames."""
+        return self.timed or self.evaluated
+
     def mean(self, metric: str, split: str | None = None) -> float | None:
         """Return the mean of a metric over the images of a split (default ``main_split``); None if not measured."""
         found = self.quality.get(split or self.main_split, {}).get(metric)
         return None if found is None else found.mean
+
+    def mean_of_all(self, metric: str) -> float | None:
+        """Return the mean of a metric over training and held-out images together, each with its region counting once.
+
+        None without such images, and where some of them lack the metric, as LPIPS is mostly left out of training views.
+        """
+        region = next(region for region in REGIONS if metric.endswith(f"_{region}"))
+        parts = [(split.get(metric), split.get(metric_id("psnr", region))) for split in self.quality.values()]
+        found = [one for one, of_region in parts if one and of_region and one.images == of_region.images]
+        images = sum(one.images for one in found)
+        if len(found) < len(parts) or not images:
+            return None
+        return math.fsum(one.images * one.mean for one in found if one.mean is not None) / images
 
 
 SUMMARY = JsonFile("records/summary.json", RunSummary)
@@ -373,6 +393,8 @@ class NovelRecord:
     """Number of real images, those of the recorded views that are shifted."""
     absent: str | None
     """Why there are no distances, and what to do about it; None if there are some."""
+    missing: dict[str, str] = field(default_factory=dict)
+    """Distance that could not be measured, such as "fid" -> why, and what to do about it."""
     shifts: tuple[NovelShift, ...]
 
 

@@ -160,8 +160,10 @@ def _lay(record: RunRecord, folder: Path) -> None:
     """Write the records of a run without the folders of its machine."""
     summary, run = record.summary, record.summary.run
     run = replace(run, command=without_folders(run.command), config=run.config | _last_words(run.config))
-    evaluated = replace(summary.evaluated, command=without_folders(summary.evaluated.command))
-    SUMMARY.write(folder, replace(summary, run=run, evaluated=evaluated))
+    evaluated, timed = (
+        one and replace(one, command=without_folders(one.command)) for one in (summary.evaluated, summary.timed)
+    )
+    SUMMARY.write(folder, replace(summary, run=run, evaluated=evaluated, timed=timed))
     if (novel := NOVEL.find(record.folder)) is not None:
         NOVEL.write(folder, replace(novel, command=without_folders(novel.command)))
     if (presets := PRESETS.find(record.folder)) is not None:

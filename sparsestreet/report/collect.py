@@ -127,8 +127,8 @@ def summary_frame(runs: Sequence[RunSummary]) -> pd.DataFrame:
     """Return a row for each run; a number that its summary lacks is NaN.
 
     Beside ``UNIT``: ``whole`` (trained on all views), ``frames`` and ``training`` (timed on a quiet machine), size and
-    times under their headings, ``Gaussians of NODE``, ``SPLIT METRIC`` for each mean of an evaluation, and ``camera
-    NUMBER METRIC`` for those of a camera.
+    times under their headings, ``Gaussians of NODE``, ``SPLIT METRIC`` for each mean of an evaluation, ``all METRIC``
+    over the images of all splits, and ``camera NUMBER METRIC`` for those of a camera.
     """
     return pd.DataFrame([dict(_numbers(run)) for run in runs])
 
@@ -152,6 +152,7 @@ def _numbers(summary: RunSummary) -> Iterator[tuple[str, object]]:
     yield "train minutes", None if seconds is None else seconds / 60
     for split, metrics in summary.quality.items():
         yield from ((f"{split} {name}", one.mean) for name, one in metrics.items())
+    yield from ((f"all {name}", summary.mean_of_all(name)) for name in summary.quality[summary.main_split])
     if summary.geometry is not None and (seen := summary.geometry.groups.get(SEEN)) is not None:
         percent = None if seen.within is None else 100 * seen.within
         yield from zip((one.column for one in GEOMETRY), (seen.median, percent), strict=True)

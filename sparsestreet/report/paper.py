@@ -10,12 +10,12 @@ from pathlib import Path
 
 from sparsestreet.metrics.definitions import Protocol
 from sparsestreet.records.run import FailedRun
-from sparsestreet.records.summary import HELD_OUT, TRAINING
+from sparsestreet.records.summary import HELD_OUT, NOVEL, TRAINING, NovelRecord
 from sparsestreet.report.tables import ABSENT, GEOMETRY, THEIRS, Cell, Grid, Quantity, number_cell, without_empty
-from sparsestreet.report.variants import Variant, busy_variants
+from sparsestreet.report.variants import Variant, busy_variants, masks_note
 
 Key = tuple[str, str, str]
-"""Views ("training", "held_out", "novel", ""), region and quantity of a column."""
+"""Views ("training", "held_out", "all", "novel", ""), region and quantity of a column."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class PublishedTable:
     number: int
     caption: str
     columns: tuple[Key, ...]
+    """Those as printed."""
     rows: tuple[PublishedRow, ...]
     views: str
     """What the paper says about the views of its numbers."""
@@ -45,6 +46,15 @@ class PublishedTable:
     def values(self, row: PublishedRow) -> Mapping[Key, float | None]:
         """Return column -> number."""
         return dict(zip(self.columns, row.values, strict=True))
+
+    @property
+    def shown(self) -> tuple[Key, ...]:
+        """The columns with ours: where the paper does not say of which views, those of all views follow."""
+        if self.views != _UNSAID:
+            return self.columns
+        held = [key for key in self.columns if key[0] == HELD_OUT]
+        rest = [key for key in self.columns if key[0] != HELD_OUT]
+        return (*held, *(("all", region, quantity) for _, region, quantity in held), *rest)
 
 
 _REGIONS = ("full", "human", "vehicle")
@@ -67,7 +77,7 @@ _ABLATION = (
     ("", "", "gaussians"),
 )
 _TWO = "reconstruction: of training views; novel views: every 10th frame"
-_UNSAID = "the paper does not say of which views; ours are the held-out ones"
+_UNSAID = "the paper does not say of which views; ours are of the held-out ones, and beside them of all"
 
 _SHIFTED = tuple(("novel", f"{meters} m", "fid") for meters in (1, 2, 3))
 
@@ -158,7 +168,7 @@ LAYOUT = _WAYMO
 """The layout of sweeps that reproduce no table of the paper."""
 
 
-_GROUPS = {TRAINING: "reconstruction", HELD_OUT: "novel views", "novel": "beside the path", "": ""}
+_GROUPS = {TRAINING: "reconstruction", HELD_OUT: "novel views", "all": "all views", "novel": "beside the path", "": ""}
 _TEXTS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "lpips": "{:.3f}", "fid": "{:.2f}", "fps": "{:.1f}"}
 
 
@@ -176,16 +186,16 @@ def paper_table(
         if matching:
             rows += [_row(variant.title, variant, table, row, protocol, lidar) for variant in matching]
         elif sweep in TABLES:
-            rows.append(_row(f"{row.name} (not run)", None, table, row, protocol, lidar))
+            what = "published only" if row.method is None else "not run"
+            rows.append(_row(f"{row.name} ({what})", None, table, row, protocol, lidar))
     rows += [_row(variant.title, variant, table, None, protocol, lidar) for variant in left]
-    width = 2 + 2 * len(table.columns) + len(lidar)
+    width = 2 + 2 * len(table.shown) + len(lidar)
     rows += [_failed(folder, failure, width) for folder, failure in failures]
     header = [("", "method"), ("", "n")]
-    for key in table.columns:
+    for key in table.shown:
         header += [(_GROUPS[key[0]], _heading(key)), (_GROUPS[key[0]], f"{_heading(key)}{THEIRS}")]
     header += [("lidar", one.heading) for one in lidar]
-    if sweep not in TABLES:
-        header, rows = without_empty(header, rows)
+    header, rows = without_empty(header, rows)
     beside = any(heading.endswith(THEIRS) for _, heading in header)
     of = f"Table {table.number} of the paper" if sweep in TABLES else "All arms, in the layout of the paper's Table 1"
     return Grid(
@@ -219,7 +229,7 @@ def _row(
     published = table.values(row) if row else {}
     runs = variant.run_names if variant else ()
     cells = [Cell(title, runs=runs), Cell(str(len(runs)) if variant else ABSENT, runs=runs)]
-    for key in table.columns:
+    for key in table.shown:
         ours = _ours(variant, key, protocol) if variant else None
         theirs = published.get(key)
         exact = "" if ours is None else f"{ours:.8g}"
@@ -236,7 +246,7 @@ def _ours(variant: Variant, key: Key, protocol: Protocol) -> float | None:
     held, whole = variant.mean(column), variant.mean(column, whole=True)
     if key[0] == TRAINING:  # as in DriveStudio, of the runs that were trained on all views where there are any
         return held if whole is None else whole
-    return whole if held is None and key[0] in ("", "novel") else held
+    return whole if held is None and key[0] in ("", "all", "novel") else held
 
 
 def _column(key: Key, protocol: Protocol) -> str | None:
@@ -288,7 +298,21 @@ def _notes(
         "n: runs; a number is the mean over scenes of the mean over each one's seeds; "
         "FPS is 1000 / median milliseconds of a frame",
     ]
-    if not any(record.summary.run.split == "none" for variant in variants for record in variant.records):
+    runs = [record.summary for variant in variants for record in variant.records]
+    folders = [record.folder for variant in variants for record in variant.records]
+    alone = sum(run.timed is not None for run in runs)
+    if alone and any(quantity == "fps" for _, _, quantity in table.columns):
+        said.append(f"FPS: {alone} of {len(runs)} runs timed alone, one after the other (evaluate DIR only=speed)")
+    if any(region in ("human", "vehicle") for _, region, _ in table.columns):
+        said += masks_note(runs)
+    if any(quantity == "fid" for _, _, quantity in table.columns):
+        said += _of_fid([found for run in folders if (found := NOVEL.find(run)) is not None])
+    if table.views == _UNSAID:
+        said.append(
+            "all views: the mean over the images of training and held-out views together, each image with the region "
+            "counting once; none where some of them lack the metric: for LPIPS say evaluate RUN training_lpips=true"
+        )
+    elif not any(run.run.split == "none" for run in runs):
         said.append(
             "reconstruction: of the training views of the runs that hold views out; no run trained on all views"
         )
@@ -297,3 +321,16 @@ def _notes(
     if failed:
         said.append("failed runs are in no mean")
     return (*said, *busy_variants(variants))
+
+
+def _of_fid(records: Sequence[NovelRecord]) -> list[str]:
+    """Say of how many images FID is, and why some runs have none."""
+    measured = [record for record in records if any("fid" in shift.distances for shift in record.shifts)]
+    counts = sorted({record.real_views for record in measured})
+    number = " to ".join(dict.fromkeys(str(count) for count in (*counts[:1], *counts[-1:])))
+    said = [
+        f"FID: Frechet distance of Inception-v3's 2,048 features, of {number} recorded images a run and as many "
+        "renders a side; the fewer images, the more of it is bias: it compares rows of one sweep, not counts of images"
+    ]
+    reasons = sorted({record.missing["fid"] for record in records if "fid" in record.missing})
+    return [*(said if counts else []), *(f"FID n/a in some runs: {reason}" for reason in reasons)]

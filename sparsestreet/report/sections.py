@@ -27,7 +27,7 @@ from sparsestreet.report.tables import (
     markdown_lines,
     spread,
 )
-from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, repeats
+from sparsestreet.report.variants import CLIP_KEYS, Repeats, log_config, masks_note, repeats
 
 
 def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) -> list[str]:
@@ -35,6 +35,7 @@ def notes(variants: Sequence[Repeats], over_scenes: bool, protocol: Protocol) ->
     runs = [run for variant in variants for run in variant.runs]
     return [
         *_general(runs, over_scenes, protocol),
+        *masks_note(runs),
         *_absent(runs, protocol),
         *_timing(runs),
         *_training(runs),
@@ -106,11 +107,11 @@ def _ranges(runs: Sequence[RunSummary]) -> list[str]:
 
 def _timing(runs: Sequence[RunSummary]) -> list[str]:
     """Say where and with what ms/frame was measured."""
-    places = [(run.latency.device, run.latency.threads, run.evaluated.machine) for run in runs]
+    places = [(run.latency.device, run.latency.threads, run.timing.machine) for run in runs]
     said = _places("ms/frame", "measured", places)
     if len({run.latency.protocol for run in runs}) > 1:
         said.append("ms/frame were taken with different numbers of renders; see each summary.json")
-    return said + _commits("measured", [run.evaluated.source for run in runs])
+    return said + _commits("measured", [run.timing.source for run in runs])
 
 
 def _training(runs: Sequence[RunSummary]) -> list[str]:

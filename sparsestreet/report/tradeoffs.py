@@ -21,7 +21,7 @@ from sparsestreet.report.tables import (
     number_cell,
     spread,
 )
-from sparsestreet.report.variants import Variant, busy_variants, plain_of
+from sparsestreet.report.variants import Variant, busy_variants, masks_note, plain_of
 
 LOSSES = (0.1, 0.3, 0.5)
 """Losses of full-image held-out PSNR, dB, that a smaller variant may have."""
@@ -93,6 +93,7 @@ def differences(variants: Sequence[Variant], protocol: Protocol) -> Grid:
     if alone:
         notes.append(f"no plain run (or several) at the same place to compare with: {', '.join(alone)}")
     header = (("", "arm - plain"), ("", "n"), *(("", f"{one.heading}{', %' if one.relative else ''}") for one in shown))
+    notes += masks_note(record.summary for variant in variants for record in variant.records)
     notes += [*_caps(variants), *busy_variants(variants)]
     return Grid("differences", "Differences to the plain method", header, tuple(rows), tuple(notes))
 

@@ -97,8 +97,21 @@ def control_of(run: RunSummary) -> str | None:
 
 
 def log_config(run: RunSummary) -> dict[str, Setting]:
-    """Return the options that select the log and the images that a run saw."""
-    return only(without(run.run.config, IDENTITY_KEYS), LOG_KEYS)
+    """Return the options that select the log and the images that a run saw, and whose masks measured it."""
+    return {**only(without(run.run.config, IDENTITY_KEYS), LOG_KEYS), "masks": masks_of(run)}
+
+
+def masks_of(run: RunSummary) -> str:
+    """Return whose masks of people and vehicles a run has, such as "fine"; "unknown" of an older record."""
+    human, vehicle = (run.run.masks.get(kind, "unknown") for kind in ("human", "vehicle"))
+    return human if human == vehicle else f"people {human}, vehicles {vehicle}"
+
+
+def masks_note(runs: Iterable[RunSummary]) -> list[str]:
+    """Return a note on whose masks the numbers of people and vehicles are of; nothing where no record tells."""
+    found = sorted({masks_of(run) for run in runs})
+    several = ": never averaged" if len(found) > 1 else ""
+    return [f"masks of people and vehicles: {' and '.join(found)}{several}"] if found not in ([], ["unknown"]) else []
 
 
 def _compared(run: RunSummary) -> dict[str, Setting]:
@@ -354,7 +367,7 @@ def why_apart(found: Sequence[Variant]) -> list[str]:
 
 
 def _place(run: RunSummary, records: Sequence[RunRecord]) -> tuple[str, ...]:
-    made, measured = run.run, run.evaluated
+    made, measured = run.run, run.timing
     device = made.device if made.device == measured.device else f"{made.device}, measured on {measured.device}"
     threads = f"{made.threads} thread{'s' if made.threads != 1 else ''}"
     threads += f", measured with {measured.threads}" if made.threads != measured.threads else ""

@@ -38,7 +38,8 @@ class RowAdam(torch.optim.Adam):
         self.refused: RefusedRows | None = None
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        super().load_state_dict(state_dict)
+        groups = _in_order_of(self.param_groups, state_dict["param_groups"])
+        super().load_state_dict({**state_dict, "param_groups": groups})
         for group in self.param_groups:
             group["fused"] = None  # of older checkpoints; torch then keeps steps on the device
         for state in self.state.values():
@@ -72,6 +73,18 @@ class RowAdam(torch.optim.Adam):
         """Step all parameters in place; ``refused``: as in ``adam_all_``."""
         parameters, gradients, first, second = zip(*tables, strict=True)
         adam_all_(parameters, gradients, first, second, refused, steps, [_width(one) for one in parameters])
+
+
+def _in_order_of(groups: Sequence[dict[str, Any]], saved: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
+    """Return saved groups in the places of those with their rates: torch goes by places alone, and the masks, whose
+    groups may hold others too, come before some and go."""
+    places = {_rate(group): place for place, group in enumerate(groups)}
+    known = len(places) == len(groups) and sorted(places) == sorted(map(_rate, saved))
+    return sorted(saved, key=lambda group: places[_rate(group)]) if known else saved
+
+
+def _rate(group: dict[str, Any]) -> str:
+    return repr(sorted(group.get("rate", {}).items()))
 
 
 def _steps(counts: list[Tensor], groups: Sequence[dict[str, Any]]) -> list[AdamStep]:

@@ -182,6 +182,7 @@ class RunIdentity:
             config=dict(self.config),
             config_hash=config_hash(self.config),
             data_hash=self.data_hash,
+            masks=_masks(data.driving_log),
             command=self.command,
             device="",
             threads=0,
@@ -202,3 +203,8 @@ def _cameras(log: DrivingLog) -> tuple[str, ...]:
     sizes = {view.indices[1]: f"{view.camera.width}x{view.camera.height}" for view in log.views}
     names = log.camera_names or tuple(map(str, range(log.num_cameras)))
     return tuple(f"{names[index]} {sizes[index]}" for index in sorted(sizes))
+
+
+def _masks(log: DrivingLog) -> dict[str, str]:
+    """Kind -> whose masks; empty where the log does not tell."""
+    return {} if log.masks is None else {kind: log.masks.get(kind, "none") for kind in ("sky", "human", "vehicle")}

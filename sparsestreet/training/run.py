@@ -154,6 +154,7 @@ def train(
                 out=out,
                 device=device,
                 ranks=ranks,
+                training_lpips=extra.training_lpips,
             )
             return None
         summary = evaluate(
@@ -259,6 +260,7 @@ def evaluate(
             command=command,
             device=device,
             timing=extra.timing,
+            training_lpips=extra.training_lpips,
             log=data.driving_log,
             ranks=ranks,
         )

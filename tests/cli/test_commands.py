@@ -254,10 +254,10 @@ def test_the_plan_of_effects_of_a_street(tiny_street, tmp_path, capsys):
 def test_an_evaluation_measures_what_the_runs_configuration_asks_for_unless_it_is_told_otherwise():
     of_run = ExtraMetrics(novel=[1.5], presets=["fast"])
     assert Options(Path("run")).extra(of_run) == of_run
-    told = Options(Path("run"), novel=(2.0,), ramp=True, presets=()).extra(of_run)
-    assert told == ExtraMetrics(novel=(2.0,), ramp=True, presets=())
+    told = Options(Path("run"), novel=(2.0,), ramp=True, presets=(), training_lpips=True).extra(of_run)
+    assert told == ExtraMetrics(novel=(2.0,), ramp=True, presets=(), training_lpips=True)
     assert extra_words(of_run) == ["novel=1.5", "presets=fast"]
-    assert extra_words(told) == ["novel=2", "ramp=true"]
+    assert extra_words(told) == ["novel=2", "ramp=true", "training_lpips=true"]
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +13,12 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 
+from sparsestreet.cli.commands import evaluate as evaluate_module
 from sparsestreet.cli.commands.evaluate import evaluate
+from sparsestreet.cli.runs.locks import sole_writer
 from sparsestreet.metrics.definitions import PROTOCOLS
 from sparsestreet.records.costs import COSTS
-from sparsestreet.records.run import RUN
+from sparsestreet.records.run import FAILURE, RUN, CodeVersion, FailedRun
 from sparsestreet.records.summary import SUMMARY
 from sparsestreet.scene.views import read_views
 from tests.cli.recompute import recompute
@@ -38,6 +41,87 @@ def evaluated_again(finished, tmp_path_factory) -> Path:
         assert evaluate([f"run={out}"]) == 0
     torch.set_num_threads(before)
     return out
+
+
+@pytest.fixture
+def sweep(finished, tmp_path) -> Path:
+    """Two finished runs, one that failed later, and one that has just begun."""
+    for name in ("a", "b", "failed"):
+        shutil.copytree(finished, tmp_path / name)
+    FAILURE.write(tmp_path / "failed", FailedRun(label="l", seed=0, command="c", error="e", trace="t"))
+    (tmp_path / "begun").mkdir()
+    return tmp_path
+
+
+def bytes_of(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_frames_of_a_sweep_are_timed_one_run_after_the_other(sweep, capsys, monkeypatch):
+    """What is timed stays after Ctrl-C, and is not timed again unless it is asked for; the log is not read."""
+    monkeypatch.setattr(evaluate_module, "data_of", lambda *given: pytest.fail("reads the log"))
+    before, true, timed = bytes_of(sweep), evaluate_module.time_again, []
+
+    def time_again(run, *given, **how):
+        timed.append(run.name)
+        if timed == ["a", "b"]:
+            raise KeyboardInterrupt
+        return true(run, *given, **how)
+
+    monkeypatch.setattr(evaluate_module, "time_again", time_again)
+    with pytest.raises(SystemExit) as ended:
+        evaluate([str(sweep), "only=speed"])
+    out, err = capsys.readouterr()
+    assert (ended.value.code, out.count("ms a frame")) == (130, 1)
+    assert "timed runs stay: give the same command to go on" in err
+    assert evaluate([str(sweep), "only=speed"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert (lines[0].endswith(" ms a frame, timed before"), timed) == (True, ["a", "b", "b"])
+    assert re.match(r"2 of 2, b: [\d.]+ ms a frame \([\d.]+ before\)", lines[1])
+    after = bytes_of(sweep)
+    files = ("cost.json", "latency.csv", "summary.json")
+    changed = {name for name in after if after[name] != before.get(name)}
+    assert changed == {f"{run}/records/{file}" for run in "ab" for file in files}
+    command = there(SUMMARY.read(sweep / "b").timed).command
+    assert command == f"sparsestreet evaluate run={sweep / 'b'} only=speed"
+    assert evaluate([str(sweep / "b"), "only=speed", "again=true"]) == 0
+    assert timed == ["a", "b", "b", "b"]
+
+
+def test_runs_that_were_timed_by_other_code_or_threads_are_timed_again(sweep, monkeypatch):
+    run = sweep / "a"
+    assert evaluate([str(run), "only=speed"]) == 0
+    summary, asked = SUMMARY.read(run), []
+    monkeypatch.setattr(evaluate_module, "time_again", lambda *given, **how: asked.append(given) or summary)
+    assert evaluate([str(run), "only=speed"]) == 0
+    assert asked == []
+    here = there(summary.timed)
+    others = (
+        {"source": CodeVersion("abc", False)}, {"machine": replace(here.machine, cores=99)}, {"threads": 99},
+        {"device": "cuda: another"},
+    )  # fmt: skip
+    for other in others:
+        SUMMARY.write(run, replace(summary, timed=replace(here, **other)))
+        assert evaluate([str(run), "only=speed"]) == 0
+    assert len(asked) == len(others)
+    views = read_views(run / "views.json")
+    assert [view.indices for view in asked[0][2]] == [view.indices for view in views.held_out]
+    with sole_writer(run):
+        assert evaluate([str(run), "only=speed", "again=true"]) == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "said"),
+    [
+        ("only=speed novel=1 training_lpips=true", 2, "leave out novel=1 training_lpips=true"),
+        ("again=true", 2, "again=true is for only=speed"),
+        ("only=quality", 2, "only"),
+        ("only=speed", 1, "holds no run that was measured"),
+    ],
+)
+def test_timing_that_cannot_be_is_refused(tmp_path, capsys, words, status, said):
+    assert evaluate([str(tmp_path), *words.split()]) == status
+    assert said in capsys.readouterr().err
 
 
 def flat_psnr(root: Path) -> float:

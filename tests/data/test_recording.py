@@ -177,7 +177,7 @@ class Broken(RecordedReader):
         shot = RecordedImage(0, 0, torch.eye(4, dtype=torch.float64), where / "image.png", "image")
         return Recording(
             "a", [camera(FLAT)], [shot], lambda shot: broken("image.png"), lambda shot: broken("mask.png"),
-            mask_kinds=frozenset({"sky"}), sweeps={0: LidarSweep(lambda: broken("sweep.bin"))},
+            mask_kinds={"sky": "shipped"}, sweeps={0: LidarSweep(lambda: broken("sweep.bin"))},
         )  # fmt: skip
 
 

@@ -61,6 +61,7 @@ def make_run(
     source: CodeVersion = CLEAN,
     machine: Machine = MACHINE,
     command: str | None = None,
+    masks: dict[str, str] | None = None,
 ) -> RunDescription:
     """What training writes, with a configuration of a few options beside the given ones."""
     method, _, sparsify = label.partition("+")
@@ -77,6 +78,7 @@ def make_run(
         config=whole,
         config_hash=config_hash(whole),
         data_hash=data_hash,
+        masks=masks or {},
         command=command or f"sparsestreet train seed={seed}",
         device=device,
         threads=threads,

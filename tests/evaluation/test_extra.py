@@ -10,12 +10,25 @@ from sparsestreet.data.datamodule import StreetData
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation import extra
-from sparsestreet.evaluation.extra import ExtraMetrics, _of_presets, _of_shifts
+from sparsestreet.evaluation.extra import ExtraMetrics, _of_presets, _of_shifts, time_again
+from sparsestreet.evaluation.speed import Timing
 from sparsestreet.ops import SplatSettings
 from sparsestreet.phases import StageRecorder
-from sparsestreet.records.summary import NOVEL, PRESETS, NovelRecord, NovelShift, PresetRecord, RenderedAs
+from sparsestreet.records.costs import COSTS, EffectGain, update_costs
+from sparsestreet.records.run import this_machine, this_source
+from sparsestreet.records.summary import (
+    LATENCY,
+    NOVEL,
+    PRESETS,
+    SUMMARY,
+    Evaluation,
+    NovelRecord,
+    NovelShift,
+    PresetRecord,
+    RenderedAs,
+)
 from sparsestreet.scene.rendering import RenderOptions
-from tests.evaluation.frames import NOISE, make_frame
+from tests.evaluation.frames import NOISE, make_frame, make_summary
 from tests.evaluation.scenes import OPTIONS, small_scene
 
 
@@ -32,6 +45,7 @@ def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_
     monkeypatch, tmp_path, stride, views, ramp
 ):
     monkeypatch.setattr(extra, "open_lpips", lambda device: ({}, {"lpips_alex": "no weights"}))
+    monkeypatch.setattr(extra, "open_inception", lambda device: (None, {"fid": "no file"}))
     (tmp_path / "records").mkdir()
     said = []
     asked = ExtraMetrics(novel=(1.0,), ramp=ramp, presets=("fast",))
@@ -40,6 +54,10 @@ def test_the_held_out_views_are_measured_and_the_training_views_where_there_are_
     assert (beside.real_views, beside.ramp) == (views, ramp)
     assert PRESETS.read(tmp_path).views == views
     assert f"1 m to the right (n={views}): nothing to compare with" in said
+    few = "distances need at least two images: hold out more views"
+    expected = {"fid": few, "alexnet": few} if views == 1 else {"fid": "no file", "alexnet": "no weights"}
+    alexnet = dict.fromkeys(("frechet_alexnet", "kernel_alexnet"), expected.pop("alexnet"))
+    assert beside.missing == expected | alexnet
 
 
 def test_what_is_said_of_a_side():
@@ -51,6 +69,8 @@ def test_what_is_said_of_a_side():
     record = NovelRecord(command="c", ramp=False, real_views=6, absent=None, shifts=tuple(shifts))
     said = [f"2 m to the {side} (n=6): fid 42, 20.00 dB to the truth" for side in ("right", "left")]
     assert list(_of_shifts(record)) == said
+    lacking = replace(record, missing={"fid": "no file", "kid": "no file", "frechet_alexnet": "no package"})
+    assert list(_of_shifts(lacking)) == [*said, "no fid, kid: no file", "no frechet_alexnet: no package"]
 
 
 NETWORK = object()
@@ -59,7 +79,8 @@ NETWORK = object()
 @pytest.mark.parametrize("weights", [{}, {"lpips_alex": NETWORK, "lpips_vgg": object()}])
 def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
     asked = {}
-    novel = NovelRecord(command="n", ramp=True, real_views=2, absent="no weights", shifts=())
+    reasons = {"fid": "no weights"}
+    novel = NovelRecord(command="n", ramp=True, real_views=2, absent="no weights", missing=reasons, shifts=())
     rendered = PresetRecord(command="p", device="d", threads=1, views=2, noise=NOISE, rendered=())
     for name, answer in (("evaluate_novel", novel), ("evaluate_presets", rendered)):
         monkeypatch.setattr(extra, name, lambda *args, n=name, a=answer, **how: asked.update({n: (args, how)}) or a)
@@ -68,6 +89,11 @@ def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
         extra, "open_lpips", lambda device: opened.append(device) or (weights, {"lpips_alex": "a", "lpips_vgg": "v"})
     )
     monkeypatch.setattr(extra, "LastLayer", lambda *given: ("features", *given))
+    inception = [object()] if weights else []
+    missing = {} if weights else {"fid": "i", "kid": "i"}
+    monkeypatch.setattr(
+        extra, "open_inception", lambda device: opened.append(device) or (*(inception or [None]), dict(missing))
+    )
     scene, data = small_scene(), street(truth=lambda view: None)
     truth = data.driving_log.truth
     told = ExtraMetrics(novel=(1.0, 2.5), ramp=True, presets=("fast", "fine"))
@@ -77,14 +103,15 @@ def test_everything_reaches_the_measurements(monkeypatch, tmp_path, weights):
     views = data.split.held_out
     assert asked["evaluate_novel"] == (
         (scene, views, (1.0, 2.5), OPTIONS),
-        {"command": "typed", "truth": truth, "absent": "a", "ramp": True,
-         "extractor": ("features", "alexnet", NETWORK) if weights else None, "lpips": NETWORK if weights else None},
+        {"command": "typed", "truth": truth, "ramp": True, "lpips": NETWORK if weights else None,
+         "extractors": [*inception, ("features", "alexnet", NETWORK)] if weights else [],
+         "missing": missing | ({} if weights else {"frechet_alexnet": "a", "kernel_alexnet": "a"})},
     )  # fmt: skip
     ways = {name: RenderOptions(SplatSettings.preset(name)) for name in ("fast", "fine")}
     assert asked["evaluate_presets"] == ((scene, views, ways, OPTIONS), {"command": "typed"})
-    assert opened == [scene.device]
+    assert opened == [scene.device] * 2
     assert (NOVEL.read(tmp_path), PRESETS.read(tmp_path)) == (novel, rendered)
-    assert said == ["no distances: no weights"]
+    assert said == ["no fid: no weights"]
     assert set(stages.seconds()) == {"other", "novel", "presets"}
 
 
@@ -130,3 +157,30 @@ def test_metrics_that_cannot_be_are_refused():
     for asked, said in cases:
         with pytest.raises(ValueError, match=said):
             ExtraMetrics(**asked)
+
+
+def test_times_are_renewed_and_nothing_else(tmp_path):
+    """Of a run with costs; one without gets none, as a record of costs says that a run is whole."""
+    before = make_summary(milliseconds=4e5, training_psnr=20.0)
+    gain = EffectGain(1.0, None, None, 3)
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    for run in (whole, part):
+        SUMMARY.write(run, before)
+    update_costs(whole, phases={"train": 9.0}, frame_ms={"splat": 4e5}, gains={"affine": gain})
+    views = street().split.held_out.views
+    for run in (whole, part):
+        time_again(run, small_scene(), views, OPTIONS, Timing(1, 3, 2), command="typed")
+        after = SUMMARY.read(run)
+        assert replace(after, latency=before.latency, latency_protocol=before.latency_protocol, timed=None) == before
+        assert after.latency.p50 < 4e5
+        assert (after.latency.clocks["frame"].repeats, after.latency.warmup, after.latency.views) == (3, 1, 2)
+        assert after.latency_protocol == after.latency.protocol
+        by = Evaluation("typed", this_machine(), this_source(), after.latency.device, after.latency.threads)
+        assert after.timed == after.timing == by
+        assert {row.clock: row.percentiles.repeats for row in LATENCY.read(run)} == {"frame": 3, "rig": 3, "raster": 3}
+    costs = COSTS.read(whole)
+    assert (costs.phases, costs.gains) == ({"train": 9.0}, {"affine": gain})
+    assert sum(costs.frame_ms.values()) < 4e5
+    assert costs.noise is not None
+    assert not COSTS.exists(part)
+    assert before.timing == before.evaluated

@@ -55,7 +55,8 @@ def rig(count):
 
 
 def evaluate(frames, offsets=(2.0,), truth=None, extractor=None, **replaced):
-    options = {"command": "c", "truth": truth, "extractor": extractor, "absent": "no weights"} | replaced
+    extractors = [] if extractor is None else [extractor]
+    options = {"command": "c", "truth": truth, "extractors": extractors, "missing": {"fid": "no weights"}} | replaced
     return evaluate_novel(SCENE, as_frames(tuple(frames)), offsets, OPTIONS, **options)
 
 
@@ -88,6 +89,7 @@ def test_distances_are_of_shifted_renders_and_real_images():
         expected = {"frechet_mean_color": frechet_distance(np.stack(ours), real)}
         assert shift.distances == expected | {"kernel_mean_color": kernel_distance(np.stack(ours), real)}
         assert (shift.truth, shift.true_views) == ({}, 0)
+    assert record.missing == {"fid": "no weights"}
 
 
 def test_the_truth_of_each_shifted_view_is_compared_by_region(monkeypatch):
@@ -129,6 +131,27 @@ def test_two_images_have_a_distance_and_one_has_none():
     one = evaluate(rig(1)[:1], extractor=MeanColor())
     assert [shift.distances for shift in one.shifts] == [{}, {}]
     assert "at least two images: hold out more views" in there(one.absent)
+    assert one.missing == dict.fromkeys(("fid", "frechet_mean_color", "kernel_mean_color"), one.absent)
+    none = evaluate(rig(1))
+    assert (none.absent, [shift.distances for shift in none.shifts]) == ("no weights", [{}, {}])
+
+
+class MeanBlue(MeanColor):
+    """FID's name, and one feature."""
+
+    name = "inception"
+
+    def __call__(self, image):
+        return image.double().mean((0, 1)).numpy()[2:]
+
+
+@pytest.mark.lengthy
+def test_each_extractor_has_distances_of_its_own():
+    both = evaluate(rig(2), extractors=[MeanBlue(), MeanColor()]).shifts
+    alone = [evaluate(rig(2), extractor=one).shifts for one in (MeanBlue(), MeanColor())]
+    assert set(both[0].distances) == {"fid", "kid", "frechet_mean_color", "kernel_mean_color"}
+    for shift, first, second in zip(both, *alone, strict=True):
+        assert shift.distances == first.distances | second.distances
 
 
 @pytest.mark.parametrize(("frames", "offsets"), [([], [1.0]), (rig(1), []), (rig(1), [1.0, 0.0]), (rig(1), [-1.0])])

@@ -85,6 +85,10 @@ def test_perceptual_distances_with_and_without_weights(tmp_path, monkeypatch):
     assert set(measured.absent) == {"lpips_vgg"}
     assert measured.mean("lpips_alex_full") > 0
     assert measured.mean("lpips_alex_full", TRAINING) is None  # of the main split only
+    asked = evaluate(tmp_path, held_out, held_out[:1], training_lpips=True)
+    first, second = (there(row.value("lpips_alex", "full")) for row in QUALITY[HELD_OUT].read(tmp_path))
+    assert asked.mean("lpips_alex_full", TRAINING) == pytest.approx(first, rel=1e-5)
+    assert asked.mean_of_all("lpips_alex_full") == pytest.approx((2 * first + second) / 3, rel=1e-5)
     rows = QUALITY[HELD_OUT].read(tmp_path)
     assert np.mean([there(row.value("lpips_alex", "full")) for row in rows]) == pytest.approx(
         measured.mean("lpips_alex_full"), rel=1e-5

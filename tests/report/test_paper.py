@@ -7,10 +7,14 @@ import pytest
 
 from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.run import FailedRun
-from sparsestreet.records.summary import HELD_OUT, TRAINING, MetricSummary
+from sparsestreet.records.summary import HELD_OUT, NOVEL, SUMMARY, TRAINING, Evaluation, MetricSummary
+from sparsestreet.report.bundle import _lay
+from sparsestreet.report.collect import RunRecord
 from sparsestreet.report.paper import TABLES, metric_id, paper_table
+from sparsestreet.report.sections import sections
 from sparsestreet.report.variants import Variant, variants
-from tests.evaluation.frames import disturbed, make_summary, with_ranges
+from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary, with_ranges
+from tests.records.novel import write_beside
 from tests.report.sweep_folder import record
 from tests.typed import there
 
@@ -37,7 +41,7 @@ def rows_of(grid):
 
 def test_published_figures_stand_beside_ours(found):
     rows = rows_of(paper_table(found, [], DRIVESTUDIO, "table1_waymo"))
-    assert list(rows)[:3] == ["EmerNeRF (not run)", "3DGS (not run)", "HUGS (not run)"]
+    assert list(rows)[:3] == ["EmerNeRF (published only)", "3DGS (not run)", "HUGS (published only)"]
     plain = rows["omnire-legacy"]
     assert plain["novel views full PSNR"].text == "29.00"
     assert (plain["novel views full PSNR, paper"].text, plain["novel views full PSNR, paper"].published) == (
@@ -140,6 +144,29 @@ def test_every_column_of_ours_is_its_own(protocol):
     assert len(theirs) == len(ours) - 2
 
 
+def test_all_views_count_every_image_once():
+    """20 dB on 2 held-out images and 26 on 6 training images: 24.5. One of them has a vehicle: 12 of 1 and 18 of 2.
+
+    LPIPS of held-out views alone is no number of all views.
+    """
+
+    def quality_of(**numbers):
+        return {name: MetricSummary(mean, None, images, 0) for name, (mean, images) in numbers.items()}
+
+    held = quality_of(psnr_full=(20.0, 2), psnr_vehicle=(12.0, 1), psnr_human=(None, 0), lpips_alex_full=(0.1, 2))
+    training = quality_of(psnr_full=(26.0, 6), psnr_vehicle=(18.0, 2), psnr_human=(17.0, 3), lpips_alex_full=(None, 0))
+    quality = {HELD_OUT: held, TRAINING: training}
+    summary = replace(make_summary("omnire+paper", training_psnr=1.0), quality=quality)
+    row = rows_of(paper_table(variants([record(summary)]), [], DRIVESTUDIO, "table5_ablation"))["omnire+paper"]
+    assert (row["novel views full PSNR"].text, row["all views full PSNR"].text) == ("20.00", "24.50")
+    assert (row["novel views vehicle PSNR"].text, row["all views vehicle PSNR"].text) == ("12.00", "16.00")
+    assert (row["novel views human PSNR"].text, row["all views human PSNR"].text) == ("-", "17.00")
+    assert (row["novel views full LPIPS"].text, row["all views full LPIPS"].text) == ("0.100", "-")
+    both = quality | {TRAINING: training | {"lpips_alex_full": MetricSummary(0.3, None, 6, 0)}}
+    assert replace(summary, quality=both).mean_of_all("lpips_alex_full") == pytest.approx(0.25)
+    assert replace(summary, quality={HELD_OUT: held, TRAINING: held}).mean_of_all("psnr_human") is None
+
+
 def test_a_scene_on_all_views_alone_has_counts_and_speed_but_no_novel_views():
     only = make_summary("omnire", psnr=None, training_psnr=30.0, milliseconds=8.0, gaussians={"a": 10}, split="none")
     row = rows_of(paper_table(variants([record(only)]), [], DRIVESTUDIO, "table1_waymo"))["omnire"]
@@ -158,13 +185,21 @@ def test_headers_and_notes_of_a_table():
     found = variants([record(make_summary("omnire")), record(make_summary("omnire+random"))])
     ablation = paper_table(found, [], DRIVESTUDIO, "table5_ablation")
     assert ablation.header[2:4] == (("novel views", "full PSNR"), ("novel views", "full PSNR, paper"))
+    regions = [f"full {one}" for one in ("PSNR", "SSIM", "LPIPS")] + ["human PSNR", "vehicle PSNR"]
+    assert ablation.header[12:17] == tuple(("all views", region) for region in regions)  # the paper has none
     assert ablation.header[-2:] == (("", "Gaussians (M)"), ("", "Gaussians (M), paper"))
     assert ablation.header[6] == ("novel views", "full LPIPS")
     assert ablation.title.startswith("Table 5 of the paper: ")
     assert ablation.notes[0].endswith("clock and machine, on its drives")
     assert ablation.notes[0].startswith("paper: published in Table 5, ")
     assert "control random: as many Gaussians, drawn at random" in ablation.notes
-    assert any(note.startswith("reconstruction: of the training views of the runs") for note in ablation.notes)
+    assert any(note.startswith("all views: the mean over the images of training and held") for note in ablation.notes)
+    table = paper_table(found, [], DRIVESTUDIO, None)
+    assert any(note.startswith("reconstruction: of the training views of the runs") for note in table.notes)
+    assert not any(note.startswith(("all views:", "masks of")) for note in table.notes)
+    fine = variants([record(make_summary("omnire", masks=dict.fromkeys(("human", "vehicle"), "fine")))])
+    assert "masks of people and vehicles: fine" in paper_table(fine, [], DRIVESTUDIO, None).notes
+    assert "masks of people and vehicles: fine" not in paper_table(fine, [], DRIVESTUDIO, "table4_novel").notes
     assert "failed runs are in no mean" not in ablation.notes
     assert f"protocol drivestudio: {', '.join(DRIVESTUDIO.metrics)}" in ablation.notes[2]
     whole = variants([record(make_summary("omnire", psnr=None, training_psnr=30.0, split="none"))])
@@ -175,6 +210,28 @@ def test_headers_and_notes_of_a_table():
     alone = paper_table([], [(Path("x"), failure)], DRIVESTUDIO, None)
     assert [len(row) for row in alone.rows] == [len(alone.header)]
     assert alone.rows[0][0].runs == ("x",)
+
+
+def test_fid_stands_in_table_4_or_says_why_not(tmp_path):
+    """The mean of both sides, for each of the rows; of how many images stands in the note, and what another lacks."""
+    for name, distances in (("a", {1.0: 40.0, -1.0: 44.0}), ("b", {2.0: 61.5, -2.0: 61.5})):
+        write_beside(tmp_path / name, distances)
+    few = NOVEL.read(tmp_path / "b")
+    NOVEL.write(tmp_path / "b", replace(few, real_views=3))
+    NOVEL.write(tmp_path / "c", replace(few, shifts=(), absent="no weights: get them", missing={"fid": "no weights"}))
+    labels = {"a": "omnire", "b": "omnire+paper", "c": "omnire+masks"}
+    found = variants([RunRecord(tmp_path / name, make_summary(label)) for name, label in labels.items()])
+    grid = paper_table(found, [], DRIVESTUDIO, "table4_novel")
+    rows = rows_of(grid)
+    beside = [rows["omnire"][f"beside the path {meters} m FID"].text for meters in (1, 2)]
+    assert beside == ["42.00", "-"]
+    assert rows["omnire"]["beside the path 2 m FID, paper"].text == "61.56"
+    assert rows["omnire+paper"]["beside the path 2 m FID"].text == "61.50"
+    (said,) = [note for note in grid.notes if note.startswith("FID: ")]
+    assert ", of 3 to 6 recorded images a run and as many renders a side; the fewer" in said
+    assert "FID n/a in some runs: no weights" in grid.notes
+    alone = paper_table([one for one in found if one.sparsify == "masks"], [], DRIVESTUDIO, "table4_novel")
+    assert [note for note in alone.notes if note.startswith("FID")] == ["FID n/a in some runs: no weights"]
 
 
 def test_words_of_a_rows_options_choose_its_arm():
@@ -201,6 +258,22 @@ def test_frames_of_a_busy_machine_carry_the_mark_where_they_stand():
         "omnire+mine": "62.5 §",
     }
     assert grid.notes[-1].endswith("compared with no other: frames of omnire+mine")
+
+
+def test_frames_that_were_timed_alone_are_said(tmp_path):
+    """Their machine is the one that timed them; a bundle names no folder of it."""
+    command = "sparsestreet evaluate run=/home/me/a only=speed"
+    alone = Evaluation(command, replace(MACHINE, cores=64), CLEAN, "cuda: x", 2)
+    runs = [make_summary("omnire"), replace(make_summary("omnire", 1), timed=alone)]
+    found = variants([record(one) for one in runs])
+    assert [variant.name for variant in found] == ["omnire (cpu: test)", "omnire (cpu: test, measured on cuda: x)"]
+    grid = paper_table(found, [], DRIVESTUDIO, None)
+    assert "FPS: 1 of 2 runs timed alone, one after the other (evaluate DIR only=speed)" in grid.notes
+    assert not any("alone" in note for note in paper_table(found, [], DRIVESTUDIO, "table5_ablation").notes)
+    (section,) = sections([record(one) for one in runs])
+    assert any("ms/frame are not comparable" in note and "64 cores" in note for note in section.notes)
+    _lay(RunRecord(tmp_path / "run", runs[1]), tmp_path / "laid")
+    assert there(SUMMARY.read(tmp_path / "laid").timed).command == "sparsestreet evaluate run=a only=speed"
 
 
 def test_columns_of_the_paper_without_a_number_are_left_out():

@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 
 from sparsestreet.records.run import CodeVersion
+from sparsestreet.report.sections import sections
 from sparsestreet.report.tradeoffs import paired
-from sparsestreet.report.variants import incomplete, plain_of, repeats, variants, why_apart
+from sparsestreet.report.variants import incomplete, masks_note, plain_of, repeats, variants, why_apart
 from tests.evaluation.frames import make_summary
 from tests.report.sweep_folder import record, street_runs
 
@@ -272,6 +273,24 @@ def test_data_that_differ_under_one_name_stand_apart():
     found = variants([record(run) for run in runs])
     assert [variant.name for variant in found] == ["plain (data aaaaaa)", "plain (data bbbbbb)"]
     assert why_apart(found)[0].startswith("runs differ in data of one name (data aaaaaa, data bbbbbb)")
+
+
+def test_runs_with_masks_of_several_sources_are_no_repeats():
+    """Nor is one whose people and vehicles are masked by two sources, nor an older record, which does not tell."""
+    sources = ({"human": "fine", "vehicle": "fine"}, {"human": "coarse", "vehicle": "coarse"},
+               {"human": "given", "vehicle": "shipped"}, {})  # fmt: skip
+    runs = [make_summary("plain", seed, masks={"sky": "none", **one} if one else {})
+            for seed, one in enumerate(sources)]  # fmt: skip
+    words = ["coarse", "fine", "people given, vehicles shipped", "unknown"]
+    found = variants([record(run) for run in runs])
+    assert [variant.name for variant in found] == [f"plain (masks={word})" for word in words]
+    options = ", ".join(f"masks={word}" for word in words)
+    assert why_apart(found)[0] == f"runs differ in options of the log ({options}): shown apart, never averaged"
+    assert masks_note(runs) == [f"masks of people and vehicles: {' and '.join(words)}: never averaged"]
+    assert masks_note(runs[:1]) == ["masks of people and vehicles: fine"]
+    assert masks_note(runs[3:]) == []
+    titles = [section.title for section in sections([record(run) for run in runs])]
+    assert sorted(title.partition("): ")[2] for title in titles) == [f"masks={word}" for word in words]
 
 
 def test_an_arm_that_lacks_seeds_is_marked_everywhere():

@@ -6,6 +6,7 @@ import torch
 from sparsestreet.scene.effects import Sky, SkySettings
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.learning_rate import LearningRate
+from sparsestreet.scene.masks import StaticMaskSettings
 from sparsestreet.training.adam import RowAdam, VisibleAdam
 from sparsestreet.training.optimizer import OptimizerSettings, set_rates
 from tests.training.stubs import background, group_of, rigid
@@ -168,3 +169,29 @@ def test_settings_choose_the_optimizer_and_its_epsilon(visible_only, kind):
     assert type(default) is kind
     assert {group["eps"] for group in default.param_groups} == {1e-15}
     assert {group["eps"] for group in coarse.param_groups} == {1e-3}
+
+
+def masked_scene(mask: StaticMaskSettings | None) -> SceneGraph:
+    """The masks' rate is that of the sky, which stands last."""
+    rates = RATES | {"rows": LearningRate(3e-3), "mask_logits": LearningRate(1e-2)}
+    sky = Sky(SkySettings(resolution=2, learning_rates={"texels": LearningRate(1e-2)}))
+    cars = rigid(4, learning_rates=dict.fromkeys(("rows", "rotation_deltas", "translation_deltas"), LearningRate(1e-5)))
+    return SceneGraph({"background": background(3, mask=mask, learning_rates=rates), "rigid": cars}, {"sky": sky})
+
+
+@pytest.mark.parametrize("visible_only", [False, True])
+def test_a_checkpoint_of_a_scene_whose_masks_are_gone_fits_one_that_never_had_any(visible_only):
+    """The sky shared the masks' group, which stood where the masks did: groups are told apart by their rates."""
+    street, bare = masked_scene(StaticMaskSettings(sparsity_weight=1e-3)), masked_scene(None)
+    trained, fresh = (OptimizerSettings(visible_only=visible_only).build(one, 1.0) for one in (street, bare))
+    for number, parameter in enumerate(street.parameters(), start=1):
+        parameter.grad = torch.full_like(parameter, float(number))
+    trained.step()
+    street.nodes["background"].finish_mask(trained)
+    saved = trained.state_dict()
+    assert [group["initial_lr"] for group in saved["param_groups"]] != [one["initial_lr"] for one in fresh.param_groups]
+    fresh.load_state_dict(saved)
+    for name, parameter in bare.named_parameters():
+        same = street.get_parameter(name)
+        assert torch.equal(fresh.state[parameter]["exp_avg"], trained.state[same]["exp_avg"]), name
+        assert group_of(fresh, parameter)["rate"] == group_of(trained, same)["rate"]

@@ -2,6 +2,7 @@
 
 import logging
 import shutil
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -225,14 +226,15 @@ def test_an_evaluation_is_handed_all_that_it_is_given(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "draw_history", lambda out: called.append(out))
     monkeypatch.setattr(ExtraMetrics, "measure", lambda self, *args, **how: called.append((self, args, how)))
     RUN.write(tmp_path, summary.run)
-    scene, frames, extra = SceneGraph({"background": background(1)}), data(), ExtraMetrics(timing=Timing(3, 4, 5))
+    scene, frames = SceneGraph({"background": background(1)}), data()
+    extra = ExtraMetrics(timing=Timing(3, 4, 5), training_lpips=True)
     options, device, said = RenderOptions(SplatSettings(near_plane=0.3)), torch.device("cpu", 0), print
     told = {"out": tmp_path, "device": device, "command": "typed"}
     with StageRecorder() as stages:
         assert run.evaluate(scene, options, frames, **told, extra=extra, say=said) is summary
     held_out, training = frames.split.held_out, frames.split.train
     measured = {"run": summary.run, "options": options, "timing": extra.timing, "ranks": ALONE} | told
-    measured |= {"log": frames.driving_log}
+    measured |= {"log": frames.driving_log, "training_lpips": True}
     assert called == [
         ((scene, held_out, training), measured),
         (extra, (scene, frames, options), {"out": tmp_path, "command": "typed", "say": said}),
@@ -303,12 +305,16 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
         name="sky", on=True, source="measured", reason="r", value=1.0, unit="", threshold=None, noise=None, numbers=6,
         ms=0.1, gain=None,
     )  # fmt: skip
-    found = who.describe(Recipe(nodes={}, seed=6), data(), 17, (sky,))
+    street = data()
+    street.driving_log = replace(street.driving_log, masks={"human": "given", "ego": "shipped"})
+    found = who.describe(Recipe(nodes={}, seed=6), street, 17, (sky,))
     expected = {"label": "l", "method": "m", "sparsify": "s", "config": config, "data_hash": "h", "command": "c"}
     expected |= {"config_hash": config_hash(config), "scene": "street", "seed": 6, "split": "every 2th frame from 1"}
     expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
     expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2, "cameras": ("0 32x16",)}
     expected |= {"effects": (sky,), "rested": {}, "held_back": {}}
+    expected |= {"masks": {"sky": "none", "human": "given", "vehicle": "none"}}
+    assert who.describe(Recipe(nodes={}, seed=6), data(), 17, (sky,)).masks == {}  # a log that does not tell
     expected |= {"light": measured_light(data().split.train).numbers()}
     assert vars(found) == expected
 

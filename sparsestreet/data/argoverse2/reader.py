@@ -419,7 +419,7 @@ class Argoverse2Reader(RecordedReader):
             shots=shots,
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=self.given.kinds.union({"ego"} if EGO_ROWS.keys() & chosen.images.keys() else ()),
+            mask_kinds=self.given.beside(["ego"] if EGO_ROWS.keys() & chosen.images.keys() else ()),
             frame_stamps=chosen.instants,
             sweeps=_sweeps(chosen, path) if self.lidar else None,
             boxes=boxes,

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from sparsestreet.data.problems import LogError, fault
 from sparsestreet.data.reader import chosen_cameras, frame_window, listed
+from sparsestreet.types import MaskSource
 
 
 def read_numbers(path: Path) -> Float64[np.ndarray, "rows columns"]:
@@ -246,6 +247,13 @@ class Layout:
             # A class that has coarse masks only counts as missing: mixing the two would change what metrics mean.
             return fine / kind if (fine / kind).is_dir() or coarse.is_dir() else None
         return coarse if coarse.is_dir() else None
+
+    @property
+    def mask_sources(self) -> dict[str, MaskSource]:
+        """Kind of ``FOLDER_KINDS`` that the log has -> whose masks they are."""
+        moving: MaskSource = "fine" if (self.root / FINE_MASKS).is_dir() else "coarse"
+        present = (kind for kind in FOLDER_KINDS if self.mask_folder(kind) is not None)
+        return {kind: "shipped" if kind == "sky" else moving for kind in present}
 
     def mask(self, kind: str, frame: int, camera: int) -> Path | None:
         folder = self.mask_folder(kind)

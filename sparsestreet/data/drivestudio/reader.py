@@ -191,6 +191,7 @@ class DriveStudioReader(LogReader):
             camera_names=tuple(str(camera.name) for camera in rig),
             dataset_from_world=dataset_from_world(origin),
             carried_by=folder.carried_by,
+            masks=layout.mask_sources,
             is_annotated=layout.has_instances,
             notes=(
                 *_notes(layout),

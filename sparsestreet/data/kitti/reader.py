@@ -244,7 +244,7 @@ class KittiReader(RecordedReader):
             shots=_shots(drive, parts),
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=self.given.kinds,
+            mask_kinds=self.given.beside(()),
             frame_stamps=parts.clock.stamps,
             sweeps=_sweeps(drive, parts) if self.lidar and drive.lidar.is_dir() else None,
             boxes=None if parts.tracklets is None else _boxes(drive, parts, parts.tracklets),

@@ -106,7 +106,7 @@ class Kitti360Reader(RecordedReader):
             shots=_shots(sequence, parts),
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=self.given.kinds.union(KINDS if labeled else ()),
+            mask_kinds=self.given.beside(KINDS if labeled else ()),
             frame_stamps=parts.stamps,
             sweeps=_sweeps(sequence, parts) if self.lidar and sequence.lidar.is_dir() else None,
             boxes=parts.boxes,

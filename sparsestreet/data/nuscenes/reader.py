@@ -221,7 +221,7 @@ class NuScenesReader(RecordedReader):
             shots=shots,
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=self.given.kinds.union({"ego"} if rows.keys() & set(chosen.cameras) else ()),
+            mask_kinds=self.given.beside(["ego"] if rows.keys() & set(chosen.cameras) else ()),
             # Behind the last image there are no frames.
             frame_stamps=tuple(chosen.instants.stamps[instant] for instant in chosen.window)[: 1 + shots[-1].frame],
             sweeps=self._sweeps(),

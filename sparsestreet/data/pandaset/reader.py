@@ -195,7 +195,7 @@ class PandaSetReader(RecordedReader):
             shots=shots,
             read_image=pixels.image,
             read_masks=pixels.masks,
-            mask_kinds=self.given.kinds.union({"ego"} if EGO_ROWS.keys() & set(chosen.cameras) else ()),
+            mask_kinds=self.given.beside(["ego"] if EGO_ROWS.keys() & set(chosen.cameras) else ()),
             frame_stamps=tuple(stamps),
             sweeps=sweeps,
             boxes=None if objects is None else objects.boxes,

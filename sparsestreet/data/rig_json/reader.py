@@ -295,7 +295,7 @@ class RigJsonReader(RecordedReader):
             shots=shots,
             read_image=pixels.image,
             read_masks=partial(_read_masks, part.table, pixels),
-            mask_kinds=self.given.kinds.union({"ego"} if any(one.ego_mask for one in cameras) else ()),
+            mask_kinds=self.given.beside(["ego"] if any(one.ego_mask for one in cameras) else ()),
             frame_stamps=part.stamps,
             sweeps=part.sweeps(shots) if self.lidar else None,
             boxes=part.boxes(),

@@ -23,7 +23,7 @@ from sparsestreet.data.synthetic.settings import StreetSettings
 from sparsestreet.data.synthetic.street import HUMAN_CLASSES, VEHICLE_CLASSES, make_street, street_name, with_declared
 from sparsestreet.data.synthetic.world import World, build_world
 from sparsestreet.geometry.cameras import inverse
-from sparsestreet.types import Camera, Frame, View
+from sparsestreet.types import Camera, Frame, MaskSource, View
 
 
 def street_truth(
@@ -124,7 +124,8 @@ class StreetReader(LogReader):
 
     def read(self) -> DrivingLog:
         log = with_declared(self._made().read(), self.settings, self.folder)
-        return replace(log, truth=street_truth(self.settings, log.dataset_from_world))
+        masks: dict[str, MaskSource] = dict.fromkeys(log.masks or (), "true")
+        return replace(log, masks=masks, truth=street_truth(self.settings, log.dataset_from_world))
 
     def data_hash(self) -> str:
         """Return the street's name, which holds a hash of all settings: they determine what the street shows."""

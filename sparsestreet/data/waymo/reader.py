@@ -238,7 +238,6 @@ class WaymoReader(RecordedReader):
         if missing := given.check((cameras[shot.camera], shot.stem) for shot in shots):
             raise LogError(missing)
         labelled = segment.labelled & {shot.key for shot in shots if given.root is None}
-        kinds = frozenset({"sky", "human", "vehicle"} if labelled else ())
         # Behind the last image there are no frames.
         seen = frames[: 1 + shots[-1].frame]
         stamps = tuple(_instant(segment, frame) for frame in seen)
@@ -248,7 +247,7 @@ class WaymoReader(RecordedReader):
             shots=shots,
             read_image=partial(_read_image, segment, rig),
             read_masks=partial(_read_masks, segment, rig, labelled, given),
-            mask_kinds=kinds | given.kinds,
+            mask_kinds=given.beside(("sky", "human", "vehicle") if labelled else ()),
             frame_stamps=stamps,
             vehicle=PosePath(torch.tensor(stamps), torch.stack([segment.world_from_vehicle(frame) for frame in seen])),
             sweeps=self._sweeps() if self.lidar else None,

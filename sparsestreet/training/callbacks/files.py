@@ -147,12 +147,15 @@ class Checkpoints(Callback):
         """Names of what is to be written after this step."""
         self._inside = False
         """Whether a step has begun and not ended."""
+        self._ready = False
+        """Whether all that a checkpoint holds is restored: before, its steps are, and moments may not."""
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: object, batch_idx: int) -> None:
         self._inside = True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Remove what a process left that was killed while it wrote one: its name has the number of that process."""
+        self._ready = True
         for half_written in self.folder.glob(".*.tmp.ckpt") if trainer.is_global_zero else ():
             half_written.unlink(missing_ok=True)
 
@@ -179,7 +182,7 @@ class Checkpoints(Callback):
         alone = ranks_of(trainer).size > 1 and not isinstance(exception, KeyboardInterrupt)
         if alone or self._inside or isinstance(exception, TornStop):
             log.warning("stopped inside step %d: go on from the checkpoint before it", trainer.global_step + 1)
-        elif trainer.global_step > 0 and self._try_to_save(trainer, pl_module, INTERRUPTED):
+        elif self._ready and trainer.global_step > 0 and self._try_to_save(trainer, pl_module, INTERRUPTED):
             log.warning("stopped after step %d; go on with resume=%s", trainer.global_step, self.folder.parent)
 
     def _names(self, trainer: Trainer, system: StreetSystem) -> Iterator[str]:
@@ -283,7 +286,8 @@ class RunFiles(Callback, RowListener):
             self.write(trainer, pl_module)
 
     def on_exception(self, trainer: Trainer, pl_module: StreetSystem, exception: BaseException) -> None:
-        if trainer.global_step > 0 and not isinstance(exception, TornStop | OSError):
+        started = self._calibration is not None  # else steps are restored, and what they made may not be
+        if started and trainer.global_step > 0 and not isinstance(exception, TornStop | OSError):
             self.write(trainer, pl_module)
 
     def write(self, trainer: Trainer, system: StreetSystem) -> None:

@@ -244,12 +244,14 @@ def test_a_mask_of_the_recording_car_holds_for_all_images_of_its_camera(tmp_path
 
 def test_fine_masks_replace_the_coarse_ones(tmp_path):
     make_nuscenes(tmp_path)
+    assert DriveStudioReader(tmp_path).read().masks == {"sky": "shipped", "human": "coarse", "vehicle": "coarse"}
     for kind in ("human", "vehicle"):
         shutil.copytree(tmp_path / "dynamic_masks" / kind, tmp_path / "fine_dynamic_masks" / kind)
     write_image(tmp_path / "fine_dynamic_masks/vehicle/000_0.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
     log = DriveStudioReader(tmp_path).read()
     assert log.frames[0].vehicle.all()
     assert not log.frames[1].vehicle.all()
+    assert log.masks == {"sky": "shipped", "human": "fine", "vehicle": "fine"}
 
 
 @pytest.mark.parametrize(
@@ -262,6 +264,7 @@ def test_what_is_optional_may_be_absent_and_is_noted(make, folder, word, tmp_pat
     log = DriveStudioReader(tmp_path).read()
     assert len(log.notes) == 1
     assert word in log.notes[0]
+    assert word not in (log.masks or {})
     absent = {"sky_masks": log.frames[0].sky, "lidar": log.frames[0].depth, "dynamic_masks/human": log.frames[0].human}
     assert absent.get(folder) is None
     assert len(log.sweeps) == (0 if folder == "lidar" else 3)

@@ -115,6 +115,7 @@ def test_images_and_depths_agree_with_the_plan(log):
     assert log.frame_rate == 10.0
     assert log.name == DRIVE
     assert [note.split(":")[0] for note in log.notes][:3] == ["no sky masks", "no human masks", "no vehicle masks"]
+    assert log.masks == {}
 
 
 def test_a_window_keeps_the_world(root, recording):
@@ -162,6 +163,7 @@ def test_masks_that_somebody_made(root, tmp_path):
     assert log.frames[0].sky.all()
     assert log.frames[1].sky is None
     assert not any(note.startswith("no sky") for note in log.notes)
+    assert log.masks == {"sky": "given"}
 
 
 def test_its_hash_is_of_what_it_reads(root, tmp_path):

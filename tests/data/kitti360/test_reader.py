@@ -136,6 +136,7 @@ def test_labels_give_masks_on_the_images_that_have_them(log):
     assert with_sky == list(LABELED)
     assert "3 of 10 images have labels, those of image_00: the others have no masks" in log.notes
     assert not any(note.startswith("no sky") for note in log.notes)
+    assert log.masks == dict.fromkeys(("sky", "human", "vehicle"), "shipped")
 
 
 def test_labels_shrink_with_the_images(root):

@@ -33,6 +33,7 @@ SETTINGS = StreetSettings(
 def test_a_street_opens_as_a_log(tmp_path):
     log = StreetReader(SETTINGS, tmp_path / "street").read()
     assert (log.num_frames, log.num_cameras, len(log.sweeps)) == (2, 2, 2)
+    assert log.masks == dict.fromkeys(("sky", "human", "vehicle"), "true")
     # Written in decimals of a nanosecond.
     assert log.frame_rate == pytest.approx(12.0, rel=1e-8)
     assert log.sweeps[1].seconds == pytest.approx(1 / 12, abs=1e-9)

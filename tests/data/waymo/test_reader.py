@@ -311,6 +311,9 @@ def test_masks_of_a_user_replace_those_of_waymo(tmp_path):
         Image.new("L", (32, 24), 255 * frame).save(path)
     log = WaymoReader(root=tmp_path / "log", masks=tmp_path / "masks").read()
     assert [None if one.sky is None else bool(one.sky.any()) for one in log.frames] == [False, None, True, None]
+    assert log.masks == {"sky": "given"}
+    own = WaymoReader(root=tmp_path / "log").read()
+    assert own.masks == dict.fromkeys(("sky", "human", "vehicle"), "shipped")
     # Frame 1 of FRONT has labels made by hand: they are not mixed with the user's.
     assert {one.vehicle for one in log.frames} == {None}
     assert "by hand" not in " ".join(log.notes)

@@ -28,8 +28,10 @@ class HalfWritten(StubTrainer):
 
 
 def trainer_in(folder: Path, every: int = 2, max_steps: int = 5) -> HalfWritten:
-    """Its only callback writes checkpoints, whose content is their step."""
-    return HalfWritten(make_system({"background": background(1)}), [Checkpoints(folder, every)], max_steps=max_steps)
+    """Its only callback writes checkpoints, whose content is their step; all is restored."""
+    trainer = HalfWritten(make_system({"background": background(1)}), [Checkpoints(folder, every)], max_steps=max_steps)
+    trainer.callbacks[0].on_train_start(trainer, trainer.system)
+    return trainer
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -91,6 +93,14 @@ def test_half_a_step_and_no_step_leave_no_checkpoint(tmp_path, step, exception):
     trainer.walk(step)
     trainer.callbacks[0].on_exception(trainer, trainer.system, exception)
     assert "interrupted.ckpt" not in contents(tmp_path)
+
+
+def test_what_fails_while_a_state_is_restored_leaves_no_checkpoint(tmp_path):
+    """Its step was, but not its moments, and the next run would have gone on from that."""
+    trainer = HalfWritten(make_system({"background": background(1)}), [Checkpoints(tmp_path)], max_steps=5)
+    trainer.global_step = 3
+    trainer.callbacks[0].on_exception(trainer, trainer.system, ValueError("another optimizer"))
+    assert contents(tmp_path) == {}
 
 
 def test_what_fails_inside_a_step_leaves_no_checkpoint(tmp_path, caplog):

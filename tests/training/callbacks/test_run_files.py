@@ -43,6 +43,7 @@ def trainer(tmp_path) -> StubTrainer:
     path = VehiclePath(vehicle, (0, 250_000_000))
     log = DrivingLog("seven", as_frames(frames), Sweeps.of(()), (), 7, 1, shift, camera_names=("wide",), vehicle=path)
     trainer.datamodule = StreetData(log, stride=3, offset=1)
+    trainer.callbacks[0].on_train_start(trainer, trainer.system)
     trainer.walk(3)
     return trainer
 
@@ -83,6 +84,12 @@ def test_no_step_and_an_interrupted_end_leave_nothing(trainer, tmp_path):
     trainer.callbacks[0].on_train_end(trainer, trainer.system)
     trainer.global_step = 0
     trainer.callbacks[0].on_exception(trainer, trainer.system, RuntimeError("no data"))
+    assert files(tmp_path) == set()
+
+
+def test_what_fails_while_a_state_is_restored_leaves_nothing(trainer, tmp_path):
+    callback = RunFiles(tmp_path, make_run(), Clock())
+    callback.on_exception(trainer, trainer.system, ValueError("another optimizer"))
     assert files(tmp_path) == set()
 
 
