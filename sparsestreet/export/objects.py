@@ -16,7 +16,10 @@ from sparsestreet.data.lazy import spread
 from sparsestreet.export.frame import selected, turned
 from sparsestreet.export.plain import plain_factors, spread_cameras
 from sparsestreet.export.ply import scene_gaussians, write_ply
+from sparsestreet.export.shapes import object_hull
 from sparsestreet.geometry.cameras import project
+from sparsestreet.geometry.meshes import ply_bytes
+from sparsestreet.scene.edits.ground import ground_mesh
 from sparsestreet.scene.nodes import Tracked
 from sparsestreet.scene.storage import StoredScene
 from sparsestreet.types import View
@@ -118,14 +121,15 @@ def _triple(values: Sequence[float]) -> tuple[float, float, float]:
     return values[0], values[1], values[2]
 
 
-POSES = "poses.json"
+POSES, GROUND = "poses.json", "ground.ply"
 
 
 @torch.no_grad()
 def write_objects(folder: Path, stored: StoredScene, views: Sequence[View]) -> list[str]:
     """Write a .ply for each object and one for all that stands still, and ``poses.json``; return the objects' names.
 
-    An object that no recorded instant shows is left out.
+    Beside them are meshes for physics: the hull of each object, in the object's frame, and the ground where it is
+    known. An object that no recorded instant shows is left out.
 
     A .ply is for viewers that do not antialias (``plain_factors``), and has x ahead, y left, z up from the middle
     of the object's box, meters; of a body, as it stands in the middle of its time. Poses are those of the recorded
@@ -146,9 +150,13 @@ def write_objects(folder: Path, stored: StoredScene, views: Sequence[View]) -> l
             found = scene_gaussians(stored, instants[0].time, nodes=still)
             factors = plain_factors([(found, spread_cameras(views))], settings)
             write_ply(temporary / "still.ply", replace(found, opacities=found.opacities * factors))
+        ground = ground_mesh(stored.scene, views)
+        if ground is not None:
+            (temporary / GROUND).write_bytes(ply_bytes(ground.mesh))
         described = {
             "axes": "x ahead, y left, z up; meters; quaternions wxyz",
             "still": "still.ply" if still else None,
+            "ground": None if ground is None else GROUND,
             "objects": objects,
         }
         (temporary / POSES).write_text(json.dumps(described, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -179,7 +187,9 @@ def _object(
     own = selected(replace(found, opacities=found.opacities * factors), rows)
     turn = torch.from_numpy(world_from_object[:3, :3]).to(own.means)
     shift = torch.from_numpy(world_from_object[:3, 3]).to(own.means)
-    file = f"{place:03d}.ply"
+    shape = object_hull(selected(found, rows), node, number, world_from_object)
+    file, hull_file = f"{place:03d}.ply", f"{place:03d}_hull.ply"
+    (folder / hull_file).write_bytes(ply_bytes(shape.mesh))
     moved = turned(replace(own, means=own.means - shift), turn.T)
     count = write_ply(folder / file, moved)
     return [
@@ -189,6 +199,8 @@ def _object(
             "node": node_name,
             "file": file,
             "gaussians": count,
+            "hull": hull_file,
+            "hull_is_box": shape.is_box,
             "size": node.sizes[number].tolist(),
             "shape_of": view.time,
             "poses": [_pose(view, frame) for view, frame in there],

@@ -1,7 +1,7 @@
-"""``street.usdz``: what AlpaSim loads of a scene beside its pictures. Three texts in a zip that is not compressed.
+"""``street.usdz``: what AlpaSim loads of a scene beside its pictures, in a zip that is not compressed.
 
-The drive of the vehicle and the instants of its images, the tracks of the objects, and what the scene is called. There
-is no mesh and no map: physics and scores of leaving the road need other sources.
+The drive of the vehicle and the instants of its images, the tracks of the objects, what the scene is called, and the
+ground that its physics sets vehicles on. There is no map: scores of leaving the road need other sources.
 """
 
 import json
@@ -19,7 +19,9 @@ from scipy.spatial.transform import Rotation
 
 import sparsestreet
 from sparsestreet.atomic import atomic_file
+from sparsestreet.geometry.meshes import ply_bytes
 from sparsestreet.scene.edits import objects_of
+from sparsestreet.scene.edits.ground import ground_mesh
 from sparsestreet.scene.loaded_scene import check_numbers
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.views import RecordedViews
@@ -35,6 +37,8 @@ _LONGEST_SHUTTER_US = 50_000
 """That a simulation may ask for: AlpaSim's own are 15,000 to 30,000."""
 _MIN_POSES = 4
 """Of a track: AlpaSim draws a spline through them. Objects seen less often stay as they were recorded."""
+_MESHES = ("mesh.ply", "mesh_ground.ply")
+"""Of the whole street, and of its ground: AlpaSim's physics reads one of them. Both are the ground."""
 _WHEN = (1980, 1, 1, 0, 0, 0)
 """Of the files in the zip: equal scenes give equal bytes."""
 
@@ -61,7 +65,8 @@ def write_artifact(
         car: length, width and height of the vehicle, meters.
 
     Returns:
-        How many ``poses``, ``cameras`` and ``objects`` there are.
+        How many ``poses``, ``cameras``, ``objects`` and ``ground vertices`` there are. Where nothing tells how high the
+        ground is, there is no mesh.
 
     Raises ValueError for a drive that is too short to start in, a number that is none, or a car that is none.
     """
@@ -71,16 +76,23 @@ def write_artifact(
         raise ValueError("a drive has two instants or more, got one: train on more frames")
     check_numbers(served.stored.scene)
     tracks = _tracks(served)
-    texts = {
+    ground = ground_mesh(served.stored.scene, views.all)
+    files: dict[str, str | bytes] = {
         "metadata.yaml": yaml.safe_dump(_metadata(served, provenance), sort_keys=False),
         "rig_trajectories.json": json.dumps(_trajectories(served, views, car), allow_nan=False),
         "sequence_tracks.json": json.dumps({served.name: tracks}, allow_nan=False),
     }
+    if ground is not None:
+        files |= dict.fromkeys(_MESHES, ply_bytes(ground.mesh))
     with atomic_file(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, text in texts.items():
-            archive.writestr(zipfile.ZipInfo(name, _WHEN), text)
-    count = len(tracks["tracks_data"]["tracks_id"])
-    return {"poses": len(served.rig.times), "cameras": len(served.rig.cameras), "objects": count}
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _WHEN), content)
+    return {
+        "poses": len(served.rig.times),
+        "cameras": len(served.rig.cameras),
+        "objects": len(tracks["tracks_data"]["tracks_id"]),
+        "ground vertices": 0 if ground is None else len(ground.mesh.vertices),
+    }
 
 
 def _metadata(served: ServedScene, provenance: Provenance) -> dict[str, Any]:

@@ -49,7 +49,13 @@ def test_a_street_is_one_file_that_commands_open(run, tmp_path, capsys):
     assert render([str(tmp_path / "again.street"), str(tmp_path / "pictures"), "frames=0:2"]) == 0
     assert len(list((tmp_path / "pictures").iterdir())) == 2
     assert export([str(small), str(tmp_path / "objects")]) == 0
-    assert "2 objects and poses.json: car, tram" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "2 objects and poses.json: car, tram" in said
+    assert "meshes: a hull of each, no ground.ply, as nothing tells how high the ground is" in said
+    assert export([str(small), str(tmp_path / "a.obj"), "time=1"]) == 0
+    assert "a.obj: 0 vertices of the ground, 1 object at time 1" in capsys.readouterr().out
+    assert export([str(small), str(tmp_path / "a.obj"), "nodes=[rigid]"]) == 2
+    assert "nodes is no option of a .obj" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["a.ply", "a.spz", "objects", "a.html"])
@@ -87,7 +93,7 @@ def test_a_ply_says_that_it_wants_antialias_where_that_is_asked_or_no_camera_is_
     assert b"\ncomment SplatRenderMode: mip\n" in (tmp_path / "a.ply").read_bytes()
 
 
-FORMATS = ["a.ply", "a.spz", "a.html", "objects", "a.usdz", "a.street"]
+FORMATS = ["a.ply", "a.spz", "a.obj", "a.html", "objects", "a.usdz", "a.street"]
 NUMBERS = [
     ("means", math.inf),
     ("opacity_logits", math.nan),

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from plyfile import PlyData
 
 from sparsestreet.export.frame import turned
 from sparsestreet.export.objects import write_objects
@@ -36,6 +37,13 @@ def test_objects_stand_where_they_were_once_their_poses_are_applied(tmp_path: Pa
     assert [pose["time"] for pose in car["poses"]] == [0, 0.25, 0.5, 0.75, 1]
     assert 0.5 <= max(pose["time"] for pose in tram["poses"]) < 1
     assert len(read_plain_ply(folder / said["still"])) == ROAD_ROWS
+    assert said["ground"] is None
+    for one in said["objects"]:
+        hull = PlyData.read(folder / one["hull"])
+        corners = np.stack([hull["vertex"][axis] for axis in "xyz"], 1)
+        assert np.abs(corners).max() <= 0.5  # half of the box
+        assert len(hull["face"]) == 2 * len(corners) - 4  # closed
+        assert not one["hull_is_box"]
     for one in said["objects"]:
         for time in (0.0, 0.5):
             found, expected = placed(folder, one, time), scene_gaussians(stored, time, instances=[one["name"]])

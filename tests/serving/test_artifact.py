@@ -1,5 +1,6 @@
 """The file that AlpaSim loads, read back with the modules of Python alone."""
 
+import io
 import json
 import zipfile
 from dataclasses import replace
@@ -7,16 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 import yaml
 from scipy.spatial.transform import Rotation
 
-from sparsestreet.scene.nodes import Rigid
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.artifact import Provenance, write_artifact
 from sparsestreet.serving.cameras import rig_of
 from sparsestreet.serving.renderer import ServedScene, edits_of, picture, view_of
 from sparsestreet.types import Shutter
 from tests.export.street import stored_street, street_views
+from tests.scene.street import background, random_rows
 from tests.serving.street import START_US, STEP_US, place, request_for, served, timed_views
 
 FROM = Provenance("1234", "abcd", 0)
@@ -44,7 +48,7 @@ def street(tmp_path_factory):
 @pytest.fixture(scope="module")
 def archive(street, tmp_path_factory):
     path = tmp_path_factory.mktemp("out") / "street.usdz"
-    assert write_artifact(path, street, VIEWS, FROM) == {"poses": 5, "cameras": 4, "objects": 1}
+    assert write_artifact(path, street, VIEWS, FROM) == {"poses": 5, "cameras": 4, "objects": 1, "ground vertices": 0}
     return path
 
 
@@ -54,6 +58,37 @@ def test_the_zip_is_not_compressed_and_has_three_texts(archive):
         assert found.namelist() == ["metadata.yaml", "rig_trajectories.json", "sequence_tracks.json"]
         assert {entry.compress_type for entry in found.infolist()} == {zipfile.ZIP_STORED}
         assert {entry.date_time for entry in found.infolist()} == {(1980, 1, 1, 0, 0, 0)}  # equal bytes on any day
+
+
+def test_the_ground_is_a_mesh_below_the_drive(tmp_path):
+    """Under the names and in the layout that AlpaSim reads: float32, triangles, in the world of the drive."""
+    made = served(tmp_path / "street")
+    flat = SceneGraph({"ground": level_road(), **dict(made.stored.scene.nodes.items())})
+    rich = replace(made, stored=replace(made.stored, scene=flat))
+    counts = write_artifact(tmp_path / "a.usdz", rich, VIEWS, FROM)
+    with zipfile.ZipFile(tmp_path / "a.usdz") as found:
+        assert found.namelist()[3:] == ["mesh.ply", "mesh_ground.ply"]
+        data = found.read("mesh_ground.ply")
+        assert found.read("mesh.ply") == data
+        (drive,) = json.loads(found.read("rig_trajectories.json"))["rig_trajectories"]
+    read = trimesh.load_mesh(io.BytesIO(data), file_type="ply", process=False)
+    assert len(read.vertices) == counts["ground vertices"] > 1000
+    for pose in drive["T_rig_worlds"]:
+        away = np.linalg.norm(read.vertices[:, :2] - np.array(pose)[:2, 3], axis=1)
+        assert away.min() < 0.36  # half of the diagonal of a square
+        assert read.vertices[away < 2, 2] == pytest.approx(-0.25, abs=0.02)
+
+
+def level_road() -> Background:
+    """A level road 0.25 m below zero, 24 m long and 16 m wide, which begins 3 m behind the first camera."""
+    places = np.random.default_rng(0).uniform([-6.0, -8.0], [18.0, 8.0], (4000, 2))
+    rows = random_rows(len(places), 0)
+    with torch.no_grad():
+        rows.means[:] = torch.from_numpy(np.column_stack([places, np.full(len(places), -0.25)])).float()
+        rows.log_scales[:] = torch.tensor([0.3, 0.3, 0.01]).log()
+        rows.quaternions[:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        rows.opacity_logits.fill_(2.0)
+    return background(rows)
 
 
 def test_metadata_has_every_key_that_is_asked_for(archive):

@@ -192,7 +192,6 @@ def test_a_checkpoint_of_a_scene_whose_masks_are_gone_fits_one_that_never_had_an
     assert [group["initial_lr"] for group in saved["param_groups"]] != [one["initial_lr"] for one in fresh.param_groups]
     fresh.load_state_dict(saved)
     for name, parameter in bare.named_parameters():
-        assert torch.equal(fresh.state[parameter]["exp_avg"], trained.state[street.get_parameter(name)]["exp_avg"]), (
-            name
-        )
-        assert group_of(fresh, parameter)["rate"] == group_of(trained, street.get_parameter(name))["rate"]
+        same = street.get_parameter(name)
+        assert torch.equal(fresh.state[parameter]["exp_avg"], trained.state[same]["exp_avg"]), name
+        assert group_of(fresh, parameter)["rate"] == group_of(trained, same)["rate"]

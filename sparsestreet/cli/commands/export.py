@@ -26,18 +26,21 @@ sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers re
   sparsestreet export outputs/RUN street.spz time=0.5            one frame for viewers, small
   sparsestreet export outputs/RUN street.spz check=true          what the file keeps and loses, measured
   sparsestreet export outputs/RUN objects/                       each object in a file, and poses.json, for engines
+  sparsestreet export outputs/RUN street.obj time=0.5            meshes for physics: the ground, hulls of objects
   sparsestreet export outputs/RUN street.usdz                    what AlpaSim loads of it (docs/serving.md)
 
   scene      a run's folder, a scene.safetensors, or a .street; the first word without a key
   out        (the second) the ending says what: a .street, the whole scene; .ply in the layout of 3DGS or .spz,
-             one frame; an .html (docs/viewing.md); no ending, a folder of objects. docs/shipping.md says what each
-             keeps
+             one frame; an .obj, meshes; an .html (docs/viewing.md); no ending, a folder of objects.
+             docs/shipping.md says what each keeps
   edits      edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   views      the views.json that holds the cameras (default: the one beside the scene, or in it)
   parts      [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
 
-of a .ply or .spz:
+of a .ply, .spz or .obj:
   time       0 to 1: first to last frame of the log (default: 0)
+
+of a .ply or .spz:
   nodes      [background,rigid]: only these nodes of the scene
   instance   only this object, by the name of its track; a name that does not exist lists those that do
   sky        true: the sky as 12,000 discs far away; not of a .ply (default: true)
@@ -63,6 +66,7 @@ _OWN = {
     ".street": (),
     ".ply": (*_FRAME, "antialias"),
     ".spz": (*_FRAME, "sky", "check"),
+    ".obj": ("time",),
     ".html": ("shapes",),
     "": (),
     ".usdz": ("car", "mount", "names"),
@@ -101,7 +105,7 @@ class ExportRequest:
         if self.kind not in _OWN:
             raise ValueError(f"the file must end in {', '.join(filter(None, _OWN))}, got {self.out.name!r}")
         others = {name for names in _OWN.values() for name in names} - set(_OWN[self.kind])
-        others |= {"edits"} if self.kind in (".usdz", ".street") else set()
+        others |= {"edits"} if self.kind in (".usdz", ".street", ".obj") else set()
         for name in sorted(others):
             if getattr(self, name) is not None:
                 raise ValueError(f"{name} is no option of a {self.kind or 'folder'}: leave it out")
@@ -123,6 +127,8 @@ def _export(request: ExportRequest) -> None:
     stored = open_scene(request.scene, "cpu", request.parts)
     if request.kind == ".street":
         return _export_street(request, stored)
+    if request.kind == ".obj":
+        return _export_shapes(request, stored, recorded_views(request.scene, request.views))
     if request.kind in (".html", "") or request.edits is not None:
         views = recorded_views(request.scene, request.views)
         stored = with_edits(stored, views, request.edits)
@@ -240,17 +246,34 @@ def _export_street(request: ExportRequest, stored: "StoredScene") -> None:
 
 
 def _export_objects(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
-    from sparsestreet.export.objects import POSES, write_objects
+    from sparsestreet.export.objects import GROUND, POSES, write_objects
     from sparsestreet.export.ply import instance_names
 
     names = write_objects(request.out, stored, views.all)
     print(f"{request.out}: {len(names)} objects and {POSES}: {', '.join(map(one_line, names))}")
+    ground = GROUND if (request.out / GROUND).is_file() else f"no {GROUND}, as nothing tells how high the ground is"
+    print(f"meshes: a hull of each, {ground}")
     absent = sorted(set(instance_names(stored)) - set(names))
     if absent:
         print(f"left out, as no recorded frame shows them: {', '.join(map(one_line, absent))}")
     if stored.options.settings.antialias:
         print(ANTIALIAS_MEAN)
     print(f"lost: {'; '.join(['the sky', 'how shapes change', *_lost_of_scene(stored)])}")
+
+
+def _export_shapes(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
+    from sparsestreet.export.shapes import write_shapes
+
+    time = request.time or 0.0
+    shapes = write_shapes(request.out, stored, views.all, time)
+    ground, count = 0 if shapes.ground is None else len(shapes.ground.mesh.vertices), len(shapes.hulls)
+    objects = f"{count} object{'' if count == 1 else 's'}"
+    print(f"{request.out}: {ground:,} vertices of the ground, {objects} at time {time:g}")
+    if shapes.ground is not None:
+        left_out, filled = f"{shapes.ground.left_out:,}", f"{shapes.ground.filled:,}"
+        print(f"left out: {left_out} places near the drive where nothing tells the ground's height; filled: {filled}")
+    if shapes.boxes:
+        print(f"boxes, as too few of their Gaussians are opaque: {', '.join(map(one_line, shapes.boxes))}")
 
 
 def _export_page(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
