@@ -28,7 +28,7 @@ from sparsestreet.records.geometry import (
 )
 from sparsestreet.records.summary import HELD_OUT, TRAINING
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.lidar import PIXELS, Rays, render_ranges
+from sparsestreet.scene.lidar import PIXEL, PIXELS, Rays, render_ranges
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Sweep, Track
 
@@ -38,8 +38,6 @@ MAX_RAYS = 20_000
 """Measured of a sweep: every second, third, ... return of one with more."""
 MIN_RANGE = 0.5
 """Meters: nearer returns are of the recording car, as in the depth term."""
-PIXEL = math.radians(0.2)
-"""Angle of a pixel. Finer ones make no smaller errors (docs/metrics.md), and take longer."""
 
 
 @torch.no_grad()

@@ -183,8 +183,12 @@ class RigRecord:
     """4x4, x ahead, y left, z up, in the re-centered world; None: the log says nothing of the car."""
     vehicle_stamps: tuple[int, ...] | None
     """Nanoseconds on the log's clock, one a pose; None: the poses are those of the frames."""
+    lidar: tuple[float, ...] | None = field(default=None, metadata=EXACT)
+    """Where its main lidar stood once in the re-centered world, x, y, z, and the normalized time; None: not known."""
 
     def __post_init__(self) -> None:
+        if self.lidar is not None and len(self.lidar) != 4:
+            raise ValueError(f"the place of a lidar is x, y, z and a time, got {list(self.lidar)}")
         for matrix in (self.dataset_from_world, *(self.world_from_vehicle or ())):
             if len(matrix) != 4 or any(len(row) != 4 for row in matrix):
                 raise ValueError(f"a pose is 4 x 4 numbers, got {matrix}")

@@ -31,6 +31,8 @@ _VIEW_ANGLES += [(0.0, math.pi / 2), (0.0, -math.pi / 2)]
 """Yaw and pitch of the optical axes, radians: level ones, the zenith and the nadir."""
 PIXELS = 2
 """Along each axis from one ray to the next. The op blurs by about a pixel, so one would mix what two rays meet."""
+PIXEL = math.radians(0.2)
+"""Angle of a pixel that suffices. Finer ones make no smaller errors (docs/metrics.md), and take longer."""
 MIN_SPACING = 1e-4
 """Radians between rays, a tenth of the finest lidar's: nobody has the memory for pixels much finer."""
 EDGE = 1.2
@@ -80,6 +82,8 @@ class Ranges:
     """Meters along each ray; infinite where more than half of the light passes all Gaussians."""
     alpha: Float[Tensor, " n"]
     """Coverage up to the Gaussian that is met, or by all of them."""
+    seconds: Float64[Tensor, " n"]
+    """Since the instant of the sweep: when the view of each ray sees sensor and objects."""
 
     @property
     def returned(self) -> Bool[Tensor, " n"]:
@@ -99,6 +103,7 @@ def render_ranges(
     """Draw the median range along each ray, without gradients.
 
     Rays that were fired at different times are drawn where sensor and objects are at the median time of their view.
+    Before and after the log, objects stand still.
 
     Args:
         scene: what is looked at.
@@ -116,13 +121,15 @@ def render_ranges(
         )
     like = rays.directions
     ranges, alpha = like.new_full((len(like),), torch.inf), like.new_zeros(len(like))
+    seconds = torch.zeros_like(alpha, dtype=torch.float64)
     for part in _fan(rays):
         moment = 0.0 if duration is None else part.seconds / duration
-        placed = scene.gaussians_at(View(part.camera, time + moment))
+        placed = scene.gaussians_at(View(part.camera, min(max(time + moment, 0.0), 1.0)))
         depths, alphas = _at(*_median_depth(placed.gaussians, part.camera, options), part.positions.to(scene.device))
         ranges[part.rows] = (depths / part.cosines.to(depths)).to(like)
         alpha[part.rows] = alphas.to(like)
-    return Ranges(ranges, alpha)
+        seconds[part.rows] = part.seconds
+    return Ranges(ranges, alpha, seconds)
 
 
 @dataclass(frozen=True)
@@ -147,10 +154,10 @@ def _fan(rays: Rays) -> Iterator[_Part]:
     places = (VIEWS * turns).long().clamp(max=VIEWS - 1)
     steep = z.abs() > math.sin(MAX_ELEVATION)
     places[steep] = torch.where(z[steep] > 0, VIEWS, VIEWS + 1)
-    late = _late(rays)
-    for place, half in torch.stack((places, late.long()), -1).unique(dim=0).tolist():
-        rows = torch.nonzero((places == place) & (late == half)).squeeze(-1)
-        yield _part(rays, rows, directions[rows], _camera_axes(*_VIEW_ANGLES[place]))
+    views = 2 * places + _late(rays)
+    for view in views.unique().tolist():
+        rows = torch.nonzero(views == view).squeeze(-1)
+        yield _part(rays, rows, directions[rows], _camera_axes(*_VIEW_ANGLES[view // 2]))
 
 
 def _late(rays: Rays) -> Bool[Tensor, " n"]:

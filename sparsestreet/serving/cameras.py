@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from sparsestreet.geometry.cameras import inverse, resized
 from sparsestreet.geometry.lenses import largest_shift
 from sparsestreet.records.run import RigRecord
-from sparsestreet.scene.edits.paths import between
+from sparsestreet.scene.edits.paths import along, between
 from sparsestreet.scene.views import DEFAULT_FRAME_RATE, RecordedViews, seconds_of
 from sparsestreet.serving import wire
 from sparsestreet.types import Camera, Shutter, Side, View
@@ -287,7 +287,7 @@ class Rig:
 
     def at(self, time: float) -> Pose:
         """world_from_rig of the recorded drive; before and after it at its ends."""
-        return _interpolated(self.times, self.poses, time)
+        return along(self.times, self.poses, time)
 
     def camera(self, name: str) -> RigCamera:
         """Raise ValueError for a name that no camera has."""
@@ -341,7 +341,7 @@ def rig_of(
     called = dict(zip(indices, _names(indices, names, known), strict=True))
     cameras = []
     for index in indices:
-        rig_from_camera = np.linalg.inv(_interpolated(times, poses, first[index].time)) @ _pose(first[index])
+        rig_from_camera = np.linalg.inv(along(times, poses, first[index].time)) @ _pose(first[index])
         cameras.append(RigCamera(called[index], index, first[index].camera, rig_from_camera))
     shift = np.eye(4) if record is None else np.array(record.dataset_from_world)
     return Rig(tuple(cameras), times, poses, clock, shift)
@@ -407,11 +407,3 @@ def _below_camera(
 
 def _pose(view: View) -> Pose:
     return inverse(view.camera.camera_from_world.double()).numpy()
-
-
-def _interpolated(times: Sequence[float], poses: Float64[np.ndarray, "n 4 4"], time: float) -> Pose:
-    after = int(np.searchsorted(times, time))
-    if after in (0, len(times)):
-        return poses[min(after, len(times) - 1)]
-    before = after - 1
-    return between(poses[before], poses[after], (time - times[before]) / (times[after] - times[before]))

@@ -48,9 +48,9 @@ class Remarks:
                 meters,
             )
 
-    def on_heights(self, served: ServedScene, view: View, edits: Edits) -> None:
+    def on_heights(self, served: ServedScene, time: float, edits: Edits) -> None:
         """Say which objects do not stand on the ground, at the first place of each."""
-        objects, gone = objects_of(served.stored.scene), served.rig.at(view.time)[2, 3] - HIDDEN
+        objects, gone = objects_of(served.stored.scene), served.rig.at(time)[2, 3] - HIDDEN
         for name, change in edits.changes.items():
             assert isinstance(change.path, Given), "requests place objects"
             x, y, z = change.path.start[:3, 3].tolist()

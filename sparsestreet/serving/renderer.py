@@ -18,6 +18,7 @@ from sparsestreet.scene.edits import Change, Edits, Given, edited, objects_of
 from sparsestreet.scene.edits.edits import found
 from sparsestreet.scene.edits.ground import Ground
 from sparsestreet.scene.effects.optics import GlobalShutter, Pinhole
+from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.rendering import render
 from sparsestreet.scene.standing import StandingScene
@@ -248,12 +249,16 @@ def frame_from_box(node: Tracked, instance: int) -> Pose:
     return lift
 
 
+def with_objects(scene: SceneGraph, edits: Edits) -> SceneGraph:
+    """Return the scene with its objects where they are placed; the scene itself where none is."""
+    return edited(scene, edits) if edits.changes else scene
+
+
 @torch.no_grad()
 def picture(served: ServedScene, view: View, edits: Edits) -> Picture:
     """The image, as ``sparsestreet render`` writes it; on the device of the scene, which takes one at a time."""
     stored = served.stored
-    scene = edited(stored.scene, edits) if edits.changes else stored.scene
-    rgb = render(scene, view, options=stored.options).rgb
+    rgb = render(with_objects(stored.scene, edits), view, options=stored.options).rgb
     return (rgb.clamp(0, 1) * 255).round().byte().cpu().numpy()
 
 

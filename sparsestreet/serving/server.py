@@ -6,10 +6,10 @@ the threads of other requests encode. No request ends the server.
 
 import logging
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import grpc
 
@@ -19,6 +19,7 @@ from sparsestreet.listening import address, check_address
 from sparsestreet.records.run import this_source
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import NotServedError, Turns, camera_spec, pose_message
+from sparsestreet.serving.lidar import lidar_message, sweep, turn_of
 from sparsestreet.serving.remarks import Remarks
 from sparsestreet.serving.renderer import (
     Picture,
@@ -50,6 +51,10 @@ _CODES = {
 of these is INTERNAL, and the server's log has its trace."""
 
 
+Drawn = TypeVar("Drawn")
+"""What a device renders: a picture, or returns."""
+
+
 class GoneError(Exception):
     """Nobody waits for the answer any more: the request was canceled, or its deadline passed."""
 
@@ -69,7 +74,7 @@ class Sensorsim:
         started = time.perf_counter()
         data = encoded(image, request.image_format, request.image_quality)
         spent["encode-ms"] = 1000 * (time.perf_counter() - started)
-        context.set_trailing_metadata(tuple((name, f"{value:.3f}") for name, value in spent.items()))
+        _say_spent(context, spent)
         return wire.kind("RGBRenderReturn")(image_bytes=data)
 
     def batch_render_rgb(self, request: Any, context: grpc.ServicerContext) -> Any:
@@ -139,10 +144,16 @@ class Sensorsim:
         return wire.kind("AvailableEgoMasksReturn")()
 
     def render_lidar(self, request: Any, context: grpc.ServicerContext) -> Any:
-        raise NotServedError("this server renders cameras, no lidar")
+        served = self.scenes.get(request.scene_id)
+        self._remarks.on_names(served, request)
+        turn, edits = turn_of(request, served.rig), edits_of(request, served)
+        self._remarks.on_heights(served, turn.time, edits)
+        found, spent = self._in_turn(lambda: sweep(served, turn, edits), context)
+        _say_spent(context, spent)
+        return lidar_message(found)
 
     def render_aggregated(self, request: Any, context: grpc.ServicerContext) -> Any:
-        raise NotServedError("this server has no lidar, so nothing to aggregate: call batch_render_rgb")
+        raise NotServedError("this server aggregates nothing: call batch_render_rgb and render_lidar")
 
     def _rendered(self, request: Any, context: grpc.ServicerContext) -> tuple[Picture, dict[str, float]]:
         """Return the picture and what it took, milliseconds, as the answer's trailing metadata call it."""
@@ -150,12 +161,15 @@ class Sensorsim:
         self._remarks.on_names(served, request)
         view, edits = view_of(request, served.rig), edits_of(request, served)
         self._remarks.on_camera(served, view)
-        self._remarks.on_heights(served, view, edits)
+        self._remarks.on_heights(served, view.time, edits)
+        return self._in_turn(lambda: picture(served, view, edits), context)
+
+    def _in_turn(self, draw: Callable[[], Drawn], context: grpc.ServicerContext) -> tuple[Drawn, dict[str, float]]:
         asked = time.perf_counter()
         with self._device.turn(partial(_check_wanted, context)):
             started = time.perf_counter()
-            image = picture(served, view, edits)
-        return image, {"wait-ms": 1000 * (started - asked), "render-ms": 1000 * (time.perf_counter() - started)}
+            drawn = draw()
+        return drawn, {"wait-ms": 1000 * (started - asked), "render-ms": 1000 * (time.perf_counter() - started)}
 
 
 def start(scenes: Scenes, host: str, port: int, workers: int) -> tuple[grpc.Server, int]:
@@ -222,6 +236,10 @@ def _status_of(error: BaseException) -> tuple[grpc.StatusCode, str]:
         return grpc.StatusCode.RESOURCE_EXHAUSTED, str(demand)
     log.error("a request failed", exc_info=error)
     return grpc.StatusCode.INTERNAL, f"{type(error).__name__}: {error}"
+
+
+def _say_spent(context: grpc.ServicerContext, spent: Mapping[str, float]) -> None:
+    context.set_trailing_metadata(tuple((name, f"{value:.3f}") for name, value in spent.items()))
 
 
 def _check_wanted(context: grpc.ServicerContext) -> None:

@@ -40,7 +40,7 @@ def said(street, caplog):
             place(request, name, at(*where))
         made.on_names(street, request)
         if all(name in ("car", "found_1") for name in objects):
-            made.on_heights(street, view_of(request, street.rig), edits_of(request, street))
+            made.on_heights(street, view_of(request, street.rig).time, edits_of(request, street))
         return caplog.messages
 
     return lines
@@ -102,6 +102,6 @@ def test_a_person_is_measured_at_its_feet(street, caplog):
         request, made = request_for(view), Remarks()
         place(request, "anna", at(x, y, center))
         caplog.clear()
-        made.on_heights(people, view_of(request, people.rig), edits_of(request, people))
+        made.on_heights(people, view_of(request, people.rig).time, edits_of(request, people))
         assert len(caplog.messages) == lines
     assert f"anna is {tall / 2:.1f} m below the ground" in caplog.text

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,10 +13,13 @@ from sparsestreet.cli.config.targets import open_run_config
 from sparsestreet.records.run import RUN
 
 if TYPE_CHECKING:
+    from sparsestreet.data.lidar_models import LidarModel
     from sparsestreet.export.layers import LidarReturns
     from sparsestreet.export.path import CameraPath
+    from sparsestreet.export.sweeps import Mounted
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.scene.views import RecordedViews
+    from sparsestreet.serving.cameras import Rig
     from sparsestreet.types import View
 
 
@@ -57,9 +60,10 @@ sparsestreet render RUN FILE [key=value ...]     a video of a trained street; th
   sparsestreet render outputs/RUN labels layers=[rgb,depth,instances]     a folder of PNGs for each layer
   sparsestreet render outputs/RUN sure.mp4 layers=[rgb,seen] edits=edits.yaml   and where the scene only guesses
   sparsestreet render outputs/RUN lidar.mp4 layers=[rgb,lidar] cameras=0  the log's lidar on the picture
+  sparsestreet render outputs/RUN sweeps lidar=hdl64 mount=1,0,1.8        what a lidar on the car would return
 
   scene     a run's folder, a scene.safetensors, or a .street; the first word without a key
-  out       (the second) a .mp4, or a folder for PNGs (a name without an ending)
+  out       (the second) a .mp4, or a folder for PNGs or sweeps (a name without an ending), or a file of one sweep
   edits     edits.yaml: objects that are gone, moved, held, copied or of another scene (docs/editing.md)
   device    cpu or cuda (default: a GPU if there is one)
   parts     [mypaper]: modules whose code is trusted, for a run with parts from outside (docs/extending.md)
@@ -86,6 +90,11 @@ the pictures:
             the log)
   log_fps   frames a second of the log (default: as its clock says, 10 where it has none)
   quality   1 to 10, of the .mp4 (default: 7)
+
+sweeps of a lidar, in place of pictures (docs/rendering.md):
+  lidar     waymo_top, hdl64, hdl32, pandar64, at128, or a .json of its angles
+  mount     [ahead,left,up] in meters: the lidar over the rear axle on the ground (default: as the log's)
+  format    ply, pcd or bin, of the files of a folder (default: ply); bin is KITTI's and has no seconds
 """
 
 PATHS = ("recorded", "shifted", "lane_change")
@@ -93,6 +102,11 @@ SLOWEST, FASTEST = 0.001, 1000.0
 """Frames a second of a video."""
 _SLOW = 5.0
 """Frames a second below which a video is a row of stills."""
+SWEEPS = ("ply", "pcd", "bin")
+"""Formats of the files of sweeps."""
+DEFAULT_MOUNT = (1.0, 0.0, 1.9)
+"""Meters ahead, left and up of the rear axle on the ground: about where roofs carry a lidar."""
+_OF_PICTURES = ("cameras", "up", "fov", "width", "height")
 LAYERS = ("rgb", "depth", "alpha", "nodes", "instances", "seen", "lidar")
 
 
@@ -118,8 +132,22 @@ class RenderRequest:
     edits: Path | None = None
     device: str | None = None
     parts: tuple[str, ...] = ()
+    lidar: str | None = None
+    mount: tuple[float, ...] | None = None
+    format: str | None = None
 
     def __post_init__(self) -> None:
+        self._check_path()
+        for name in ("fps", "log_fps"):
+            value = getattr(self, name)
+            if value is not None and not SLOWEST <= value <= FASTEST:
+                raise ValueError(f"{name} lies in {SLOWEST:g} to {FASTEST:g}, got {value:g}")
+        if self.lidar is None:
+            self._check_pictures()
+        else:
+            self._check_sweeps()
+
+    def _check_path(self) -> None:
         if self.path not in PATHS and not self.path.endswith(".json"):
             raise ValueError(f"path must be one of {', '.join(PATHS)}, or a .json, got {self.path!r}")
         if (self.path in ("shifted", "lane_change")) != (self.offset is not None):
@@ -128,7 +156,12 @@ class RenderRequest:
             for name in ("cameras", "frames"):
                 if getattr(self, name) is not None:
                     raise ValueError(f"{name}= chooses of the log's, and {self.path} has poses of its own")
-        for name in ("fps", "log_fps", "width", "height"):
+
+    def _check_pictures(self) -> None:
+        for name in ("mount", "format"):
+            if getattr(self, name) is not None:
+                raise ValueError(f"{name}= is of sweeps: say which lidar= draws them")
+        for name in ("width", "height"):
             value = getattr(self, name)
             if value is not None and value <= 0:
                 raise ValueError(f"{name} must be above 0, got {value:g}")
@@ -136,15 +169,22 @@ class RenderRequest:
             raise ValueError(f"fov lies between 0 and 180 degrees, got {self.fov:g}")
         if self.out.suffix not in (".mp4", ""):
             raise ValueError(f"a video ends in .mp4, a folder of PNGs has no ending, got {self.out.name!r}")
-        for name in ("fps", "log_fps"):
-            value = getattr(self, name)
-            if value is not None and not SLOWEST <= value <= FASTEST:
-                raise ValueError(f"{name} lies in {SLOWEST:g} to {FASTEST:g}, got {value:g}")
         if not 1 <= self.quality <= 10:
             raise ValueError(f"quality lies in 1 to 10, got {self.quality:g}")
         for layer in self.layers:
             if layer not in LAYERS or self.layers.count(layer) > 1:
                 raise ValueError(f"layers are {', '.join(LAYERS)}, each once, got {', '.join(self.layers)}")
+
+    def _check_sweeps(self) -> None:
+        given = [name for name in _OF_PICTURES if getattr(self, name) is not None]
+        if given or self.layers != ("rgb",):
+            raise ValueError(f"{(given or ['layers'])[0]}= is of pictures, and lidar= draws sweeps: leave one out")
+        if self.out.suffix[1:] not in (*SWEEPS, ""):
+            raise ValueError(f"a sweep ends in .{', .'.join(SWEEPS)}, a folder has no ending, got {self.out.name!r}")
+        if self.format is not None and (self.format not in SWEEPS or self.out.suffix):
+            raise ValueError(f"format is {', '.join(SWEEPS)}, of the files of a folder, got {self.format!r}")
+        if self.mount is not None and len(self.mount) != 3:
+            raise ValueError(f"mount is three numbers, ahead, left and up, got {len(self.mount)}")
 
     @property
     def path_file(self) -> Path | None:
@@ -158,21 +198,21 @@ def render(arguments: list[str]) -> int:
 
 
 def _render(request: RenderRequest) -> None:
+    (_render_pictures if request.lidar is None else _render_sweeps)(request)
+
+
+def _render_pictures(request: RenderRequest) -> None:
     # Imported here: torch takes a second, and --help needs none of it.
     from sparsestreet.cli.commands.options import shown
     from sparsestreet.cli.commands.scenes import folder_of, open_scene, recorded_views, with_edits
     from sparsestreet.export.layers import count_images
     from sparsestreet.export.video import check_destination, check_size, picture_size
-    from sparsestreet.scene.views import DEFAULT_FRAME_RATE
 
     started = time.perf_counter()
     check_destination(request.out)
     stored = open_scene(request.scene, request.device, request.parts).standing()
     views = recorded_views(request.scene, request.views)
-    log_fps = request.log_fps or views.frame_rate
-    if log_fps is None:
-        log_fps = DEFAULT_FRAME_RATE
-        print(f"the log's frame rate is not known: taken as {log_fps:g} a second (log_fps=...)")
+    log_fps = _log_fps(request, views)
     path, fps, what = _path(request, views, log_fps)
     path = _seen_by(request, path)
     if request.out.suffix:
@@ -191,6 +231,84 @@ def _render(request: RenderRequest) -> None:
     count = _write(request, stored, path, fps, returns)
     made = f"made in {time.perf_counter() - started:.0f} s"
     print(f"{request.out}: {count} frames of {what} at {fps:g} a second{_speed(request, log_fps)}, {made}")
+
+
+def _log_fps(request: RenderRequest, views: "RecordedViews") -> float:
+    from sparsestreet.scene.views import DEFAULT_FRAME_RATE
+
+    known = request.log_fps or views.frame_rate
+    if known is None:
+        print(f"the log's frame rate is not known: taken as {DEFAULT_FRAME_RATE:g} a second (log_fps=...)")
+    return known or DEFAULT_FRAME_RATE
+
+
+def _render_sweeps(request: RenderRequest) -> None:
+    from sparsestreet.cli.commands.options import shown
+    from sparsestreet.cli.commands.scenes import open_scene, recorded_views, with_edits
+    from sparsestreet.data.lidar_models import lidar_model
+    from sparsestreet.export.sweeps import Instant, write_sweeps
+
+    started = time.perf_counter()
+    model = lidar_model(request.lidar or "")
+    stored = open_scene(request.scene, request.device, request.parts).standing()
+    views = recorded_views(request.scene, request.views)
+    log_fps = _log_fps(request, views)
+    path, _, _ = _path(request, views, log_fps)
+    instants = [Instant(rig[0].time, rig[0].frame_index) for rig in path]
+    if request.out.suffix and len(instants) > 1:
+        raise ValueError(f"{request.out.name} holds one sweep, and {len(instants)} are wanted: frames=0:1, or a folder")
+    lidar = _mounted(request, model, views, path, log_fps)
+    stored = with_edits(stored, views, request.edits)
+    print("intensities are 0: no scene has learned any")
+    ending = f".{request.format or SWEEPS[0]}"
+    count = len(instants)
+    points = write_sweeps(
+        request.out, stored, lidar, shown(instants, count, "sweeps") if count > 1 else instants, ending
+    )
+    made = f"made in {time.perf_counter() - started:.0f} s"
+    print(f"{request.out}: {count} sweep{'s'[: count > 1]} of {model.name}, {points:,} points, {made}")
+
+
+def _mounted(
+    request: RenderRequest, model: "LidarModel", views: "RecordedViews", path: "CameraPath", log_fps: float
+) -> "Mounted":
+    """Put the lidar on the car; between the chosen instants it goes on as along all of the log."""
+    import numpy as np
+
+    from sparsestreet.export.sweeps import mounted
+    from sparsestreet.geometry.cameras import inverse
+    from sparsestreet.scene.storage import rig_record
+    from sparsestreet.scene.views import seconds_of
+    from sparsestreet.serving.cameras import rig_of
+
+    record = rig_record(request.scene)
+    rig = rig_of(views, record, frame_rate=log_fps)
+    vehicle_from = {one.index: np.linalg.inv(one.rig_from_camera) for one in rig.cameras}
+    if request.frames is not None and request.path != "lane_change":
+        path, _, _ = _path(replace(request, frames=None), views, log_fps)
+    vehicles = []
+    for one in path:
+        camera = rig.cameras[0].index if one[0].camera_index is None else one[0].camera_index
+        vehicles.append(inverse(one[0].camera.camera_from_world.double()).numpy() @ vehicle_from[camera])
+    mount = request.mount or _known_mount(rig, None if record is None else record.lidar)
+    times = [one[0].time for one in path]
+    return mounted(model, times, vehicles, mount, seconds_of(views, log_fps))
+
+
+def _known_mount(rig: "Rig", place: Sequence[float] | None) -> tuple[float, ...]:
+    """Return where the log's lidar was on the car, or where others have theirs, and say so."""
+    import numpy as np
+
+    mount = DEFAULT_MOUNT
+    if place is not None:
+        *world, instant = place
+        mount = tuple((np.linalg.inv(rig.at(instant)) @ [*world, 1.0])[:3].tolist())
+    said = ", ".join(
+        f"{round(one, 2) + 0.0:.2f} m {where}" for one, where in zip(mount, ("ahead", "left", "up"), strict=True)
+    )
+    whose = "as roofs carry one" if place is None else "as the log's"
+    print(f"the lidar is {said} of the car's origin, {whose} (mount=...)")
+    return mount
 
 
 def _path(request: RenderRequest, views: "RecordedViews", log_fps: float) -> "tuple[CameraPath, float, str]":

@@ -172,3 +172,12 @@ def between(start: Frame, end: Frame, share: float) -> Frame:
     frame[:3, :3] = start[:3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
     frame[:3, 3] = (1 - share) * start[:3, 3] + share * end[:3, 3]
     return frame
+
+
+def along(times: Sequence[float], frames: Float64[np.ndarray, "n 4 4"], time: float) -> Frame:
+    """Return the frame at a time between those that are known; before and after them it stands at their ends."""
+    after = int(np.searchsorted(times, time))
+    if after in (0, len(times)):
+        return frames[min(after, len(times) - 1)]
+    before = after - 1
+    return between(frames[before], frames[after], (time - times[before]) / (times[after] - times[before]))

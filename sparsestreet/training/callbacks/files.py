@@ -22,6 +22,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file, check_regular
+from sparsestreet.data.lazy import Sweeps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.speed import device_name
 from sparsestreet.naming import kept_before
@@ -333,7 +334,14 @@ def _rig(log: DrivingLog) -> RigRecord:
         dataset_from_world=_matrix(log.dataset_from_world),
         world_from_vehicle=None if vehicle is None else tuple(_matrix(pose) for pose in vehicle.poses),
         vehicle_stamps=None if vehicle is None else vehicle.stamps,
+        lidar=_lidar_place(log.sweeps),
     )
+
+
+def _lidar_place(sweeps: Sweeps) -> tuple[float, ...] | None:
+    """Return where the lidar of the sweep in the middle stood, and when."""
+    middle = next(sweeps.at([len(sweeps) // 2]).gray(), None) if len(sweeps) else None
+    return None if middle is None or middle.origin is None else (*middle.origin.tolist(), middle.time)
 
 
 def _matrix(pose: Float64[Tensor, "4 4"]) -> Matrix:

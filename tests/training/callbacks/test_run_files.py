@@ -18,6 +18,7 @@ from sparsestreet.scene.views import read_views
 from sparsestreet.training.callbacks import Clock, RunFiles
 from sparsestreet.training.callbacks.density_control import resize_rows
 from sparsestreet.training.callbacks.files import TornStop
+from sparsestreet.types import Sweep
 from tests.evaluation.frames import make_run
 from tests.training.stubs import StubTrainer, background, frame_at, make_system, rigid
 from tests.typed import there
@@ -41,7 +42,14 @@ def trainer(tmp_path) -> StubTrainer:
     shift, vehicle = torch.eye(4).double(), torch.eye(4).double().repeat(2, 1, 1)
     shift[0, 3], vehicle[1, 2, 3] = 0.1 + 0.2, 0.125
     path = VehiclePath(vehicle, (0, 250_000_000))
-    log = DrivingLog("seven", as_frames(frames), Sweeps.of(()), (), 7, 1, shift, camera_names=("wide",), vehicle=path)
+    points = torch.full((1, 3), 0.5)
+    sweeps = tuple(
+        Sweep(frame, frame / 6, points, points, torch.ones(1).bool(), origin=torch.tensor([0.1, 0.2, frame]).double())
+        for frame in (1, 2, 4)
+    )
+    log = DrivingLog(
+        "seven", as_frames(frames), Sweeps.of(sweeps), (), 7, 1, shift, camera_names=("wide",), vehicle=path
+    )
     trainer.datamodule = StreetData(log, stride=3, offset=1)
     trainer.callbacks[0].on_train_start(trainer, trainer.system)
     trainer.walk(3)
@@ -68,6 +76,7 @@ def test_the_end_of_training_and_an_interruption_between_two_steps_leave_all(tra
     assert (rig.camera_names, rig.vehicle_stamps) == (("wide",), (0, 250_000_000))
     assert rig.dataset_from_world[0] == (1.0, 0.0, 0.0, 0.1 + 0.2)  # as they are, not rounded
     assert there(rig.world_from_vehicle)[1][2] == (0.0, 0.0, 1.0, 0.125)
+    assert there(rig.lidar) == pytest.approx((0.1, 0.2, 2.0, 2 / 6))
     run = RUN.read(tmp_path)
     assert (run.steps, run.training_seconds) == (trainer.global_step, 12.5)
     assert (run.label, run.caps) == (make_run().label, {})
