@@ -213,7 +213,7 @@ def _hdl64() -> LidarModel:
         first=180.0,
         step=-360 / 2083,
         reach=120.0,
-        source="Velodyne HDL-64E S2 manual: nominal angles, 0.1728 degrees at 10 Hz, no offsets",
+        source="Velodyne HDL-64E, nominal: rows of a KITTI sweep lie 0.3 to 0.8 degrees higher",
     )
 
 
@@ -226,7 +226,7 @@ def _hdl32() -> LidarModel:
         first=180.0,
         step=-360 / 1085,
         reach=100.0,
-        source="Velodyne HDL-32E manual: nominal angles, 46.08 us a firing, at nuScenes' 20 Hz",
+        source="Velodyne HDL-32E, nominal: rows of a nuScenes sweep above -20 degrees lie within 0.1 degrees, at 20 Hz",
         hertz=20.0,
     )
 

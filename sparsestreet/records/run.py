@@ -103,6 +103,9 @@ class RunDescription:
     """Name and image size of each camera that is read, such as "CAM_FRONT 1600x900"; empty: the record is older."""
     config: dict[str, Setting] = field(metadata=EXACT)
     """The resolved configuration, flat: dotted key -> value."""
+    follows: dict[str, Setting] = field(default_factory=dict, metadata=EXACT)
+    """Option of ``config`` that grew with the number of training images -> what it is where nothing grows, which is
+    the same for logs of all lengths; empty: none grew, or the record is older."""
     config_hash: str
     """``configuration.config_hash`` of ``config``; equal for repeats."""
     data_hash: str

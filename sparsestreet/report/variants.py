@@ -23,8 +23,8 @@ from sparsestreet.report.collect import CLIP_KEYS, RunRecord, by_unit, clip_of, 
 from sparsestreet.report.tables import BUSY, CLOCKS, busy_note
 
 LOG_KEYS = ("data.log.*",)
-SECTION_KEYS = ("split.*", *LOG_KEYS)
-"""Options that determine the images a run is measured on. They put runs into different tables, not columns."""
+SECTION_KEYS = ("split.*", "training_views.*", *LOG_KEYS)
+"""Options that determine the images a run sees and is measured on. They put runs into different tables, not columns."""
 
 
 _EARLIER_CONTROLS = {
@@ -115,9 +115,9 @@ def masks_note(runs: Iterable[RunSummary]) -> list[str]:
 
 
 def _compared(run: RunSummary) -> dict[str, Setting]:
-    """Return the options by which runs of one table may differ."""
+    """Return the options by which runs of one table may differ; what grew with a log as where nothing grows."""
     follows = COUNT_KEYS if control_of(run) and run.run.config.get("count_of") else ()
-    return without(run.run.config, (*IDENTITY_KEYS, *SECTION_KEYS, *follows))
+    return without({**run.run.config, **run.run.follows}, (*IDENTITY_KEYS, *SECTION_KEYS, *follows))
 
 
 def _options(run: RunSummary, others: Iterable[RunSummary]) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -162,6 +162,8 @@ class RunIdentity:
     """What makes it small, such as "paper"; "none" for a plain run."""
     config: Mapping[str, Setting] = field(default_factory=dict)
     """The resolved configuration, flat: dotted key -> value; empty where there is none."""
+    follows: Mapping[str, Setting] = field(default_factory=dict)
+    """As in ``RunDescription``."""
     data_hash: str = ""
     """``LogReader.data_hash``; empty where nobody asked for it."""
     command: str = "python"
@@ -180,6 +182,7 @@ class RunIdentity:
             split=data.split_in_words,
             cameras=_cameras(data.driving_log),
             config=dict(self.config),
+            follows=dict(self.follows),
             config_hash=config_hash(self.config),
             data_hash=self.data_hash,
             masks=_masks(data.driving_log),

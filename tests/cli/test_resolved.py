@@ -2,6 +2,7 @@
 
 import copy
 import re
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 from sparsestreet.cli.config.compose import CONF, configuration, options_of, resolved
-from sparsestreet.cli.runs.run import recipe_of, with_images
+from sparsestreet.cli.runs.run import identity_of, recipe_of, with_images
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, LightGaussianRule, MiniSplattingRule
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.training.callbacks import DensityControl, Pruning
@@ -236,3 +237,17 @@ SPLITS = {"omnire": (10, 10), "streetgs": (4, 4), "pvg": (4, 3), "neurad": (2, 1
 def test_what_is_held_out(name):
     split = composed(f"protocol={name}", "data.root=x").split
     assert (split.stride, split.offset) == SPLITS[name]
+
+
+def test_a_record_tells_what_grew_with_the_log(tmp_path, monkeypatch):
+    """A value that was given stands for itself, however long the log is."""
+    monkeypatch.setattr("sparsestreet.cli.runs.run.reader_of", lambda cfg: SimpleNamespace(data_hash=lambda: "log"))
+
+    def follows(images, *words):
+        return dict(identity_of(with_images(composed(*words), images), "train").follows)
+
+    grown, given = follows(1000), follows(1000, "node.background.max_gaussians=200000")
+    assert grown["node.background.max_gaussians"] == 130_000
+    assert grown.keys() - given.keys() == {"node.background.max_gaussians"}
+    assert "training_views.images" not in grown
+    assert follows(50) == {}

@@ -62,6 +62,7 @@ def make_run(
     machine: Machine = MACHINE,
     command: str | None = None,
     masks: dict[str, str] | None = None,
+    follows: dict[str, Setting] | None = None,
 ) -> RunDescription:
     """What training writes, with a configuration of a few options beside the given ones."""
     method, _, sparsify = label.partition("+")
@@ -76,6 +77,7 @@ def make_run(
         seed=seed,
         split=split,
         config=whole,
+        follows=follows or {},
         config_hash=config_hash(whole),
         data_hash=data_hash,
         masks=masks or {},

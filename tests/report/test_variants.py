@@ -51,6 +51,21 @@ def test_a_data_sets_own_options_are_no_name_where_nodes_take_them_over():
     assert names(repeats([here], [here, there])) == [("m", 1)]
 
 
+def test_drives_of_several_lengths_are_one_row():
+    """All frames or nine of ten, and drives of more frames: limits grow with them, and Table 1 had a row for each."""
+
+    def drive(images, limit, **follows):
+        config = {"training_views.images": images, "node.background.max_gaussians": limit}
+        return make_summary("m", config=config, scene=f"drive {images}", follows=follows)
+
+    least = {"node.background.max_gaussians": 130_000}
+    short, long, longer = drive(100, 130_000), drive(450, 289_000, **least), drive(500, 321_100, **least)
+    assert names(repeats([short, long, longer])) == [("m", 3)]
+    given = drive(500, 321_100)  # as somebody wrote
+    told = [("m node.background.max_gaussians=130000", 2), ("m node.background.max_gaussians=321100", 1)]
+    assert names(repeats([short, long, given])) == told
+
+
 def test_what_follows_from_a_given_option_is_left_to_the_notes():
     small = make_summary("m", config={"capacity": "small", "node.num_points": 20, "node.cap": 4})
     command = "sparsestreet train capacity=paper"

@@ -113,13 +113,18 @@ def trainer_of(cfg: DictConfig, devices: Any) -> Callable[..., Trainer]:
     return instantiate(cfg.trainer, _partial_=True, devices=devices)
 
 
+_IMAGES = "training_views.images"
+
+
 def identity_of(cfg: DictConfig, command: str) -> RunIdentity:
     """What the run is called in its records. Reads the log's files for their hash."""
+    config, least = (flat_config(resolved(one)) for one in (cfg, with_images(cfg, None)))
     return RunIdentity(
         label=cfg.name,
         method=cfg.method.name,
         sparsify=cfg.sparsify.name,
-        config=flat_config(resolved(cfg)),
+        config=config,
+        follows={key: value for key, value in least.items() if value != config.get(key) and key != _IMAGES},
         data_hash=reader_of(cfg).data_hash(),
         command=command,
     )
