@@ -52,7 +52,11 @@ def grid_mesh(
 
 
 def hull(points: Float[np.ndarray, "n 3"]) -> Mesh | None:
-    """Return the convex hull of points; None of fewer than four, and of points in a plane."""
+    """Return the convex hull of points; None of fewer than four, and of points in a plane.
+
+    >>> len(hull(np.concatenate([np.zeros((1, 3)), np.eye(3)])).faces), hull(np.eye(3))
+    (4, None)
+    """
     if len(points) < 4:
         return None
     try:
@@ -68,12 +72,20 @@ def hull(points: Float[np.ndarray, "n 3"]) -> Mesh | None:
 
 
 def box_corners(low: Float64[np.ndarray, "3"], high: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "8 3"]:
-    """Return the corners of a box with such ends."""
+    """Return the corners of a box with such ends.
+
+    >>> box_corners(np.zeros(3), np.ones(3)).sum(0)
+    array([4., 4., 4.])
+    """
     return np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), -1).reshape(8, 3)
 
 
 def ply_bytes(mesh: Mesh) -> bytes:
-    """Return a mesh as a .ply: binary, little endian, float32, three corners a face, as AlpaSim reads it."""
+    """Return a mesh as a .ply: binary, little endian, float32, three corners a face, as AlpaSim reads it.
+
+    >>> ply_bytes(Mesh(np.eye(3), np.array([[0, 1, 2]])))[-12:]  # the corners of the face
+    b'\\x00\\x00\\x00\\x00\\x01\\x00\\x00\\x00\\x02\\x00\\x00\\x00'
+    """
     faces = np.empty(len(mesh.faces), _PLY_FACE)
     faces["count"], faces["corners"] = 3, mesh.faces
     header = (

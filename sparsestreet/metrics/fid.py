@@ -246,6 +246,10 @@ def read_inception(path: Path) -> InceptionV3:
     """Read the network from a file of pytorch-fid; nothing in the file is run.
 
     Raises FileNotFoundError, or ValueError, naming the file and what differs, if it is damaged or of another network.
+
+    >>> read_inception(Path("/nowhere/weights.pth"))
+    Traceback (most recent call last):
+    FileNotFoundError: [Errno 2] No such file or directory: '/nowhere/weights.pth'
     """
     check_regular(path)
     network = InceptionV3()

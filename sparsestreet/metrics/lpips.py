@@ -175,7 +175,12 @@ def _unit(features: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
 
 
 def full_precision(device: torch.device):
-    """Turn off TF32, in which cuDNN rounds the factors of convolutions to 10 bits."""
+    """Turn off TF32, in which cuDNN rounds the factors of convolutions to 10 bits.
+
+    >>> with full_precision(torch.device("cpu")):
+    ...     print(torch.full((1,), 0.5) * 3)
+    tensor([1.5000])
+    """
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False) if device.type == "cuda" else nullcontext()
 
 

@@ -300,7 +300,7 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
     monkeypatch.setattr(identity_module, "this_machine", lambda: machine)
     monkeypatch.setattr(identity_module, "this_source", lambda: source)
     config = {"seed": 4, "a": 1}
-    who = RunIdentity(label="l", method="m", sparsify="s", config=config, data_hash="h", command="c")
+    who = RunIdentity(label="l", method="m", sparsify="s", config=config, follows={"a": 0}, data_hash="h", command="c")
     sky = EffectDecision(
         name="sky", on=True, source="measured", reason="r", value=1.0, unit="", threshold=None, noise=None, numbers=6,
         ms=0.1, gain=None,
@@ -309,6 +309,7 @@ def test_a_run_is_described_by_its_parts(monkeypatch):
     street.driving_log = replace(street.driving_log, masks={"human": "given", "ego": "shipped"})
     found = who.describe(Recipe(nodes={}, seed=6), street, 17, (sky,))
     expected = {"label": "l", "method": "m", "sparsify": "s", "config": config, "data_hash": "h", "command": "c"}
+    expected |= {"follows": {"a": 0}}
     expected |= {"config_hash": config_hash(config), "scene": "street", "seed": 6, "split": "every 2th frame from 1"}
     expected |= {"max_steps": 17, "machine": machine, "source": source, "steps": 0, "threads": 0, "device": ""}
     expected |= {"training_seconds": None, "noise": None, "caps": {}, "format": 2, "cameras": ("0 32x16",)}

@@ -237,7 +237,7 @@ LOST = {
 DERIVED = {
     "camera", "time", "seconds", "depth", "span", "times", "colors", "colored", "index", "frame_index", "camera_index",
     "notes", "carried_by", "origin", "first_axes", "hoods", "dirt", "dataset_from_world",
-    "num_frames", "num_cameras", "frames",
+    "num_frames", "num_cameras", "frames", "masks",
 }  # fmt: skip
 """Fields that follow from others, are of the reader or found in images, or are looked at one by one."""
 
