@@ -25,8 +25,8 @@ from sparsestreet.scene.edits.ground import ground_mesh
 from sparsestreet.scene.loaded_scene import check_numbers
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.views import RecordedViews
-from sparsestreet.serving.cameras import Pose, Rig, RigCamera
 from sparsestreet.serving.renderer import ServedScene, frame_from_box
+from sparsestreet.serving.rig import Pose, Rig, RigCamera
 
 DEFAULT_CAR = (4.8, 1.9, 1.6)
 """Length, width, height of the vehicle, meters; the rear axle is 1 m before its rear end."""

@@ -13,8 +13,9 @@ from sparsestreet.scene.edits import Edits
 from sparsestreet.scene.edits.paths import between
 from sparsestreet.scene.sweeps import Returns, render_sweep
 from sparsestreet.serving import wire
-from sparsestreet.serving.cameras import NotServedError, Pose, Rig, matrix
+from sparsestreet.serving.cameras import NotServedError, matrix
 from sparsestreet.serving.renderer import ServedScene, with_objects
+from sparsestreet.serving.rig import Pose, Rig
 
 _MODELS = {"AT128": "at128"}
 """Name of the interface -> of the tables."""

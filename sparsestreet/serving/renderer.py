@@ -26,7 +26,8 @@ from sparsestreet.scene.storage import SCENE_FILE as SCENE_FILE
 from sparsestreet.scene.storage import STREET_FILE, StoredScene, rig_record, scene_path, views_of
 from sparsestreet.scene.views import VIEWS_FILE as VIEWS_FILE
 from sparsestreet.serving import wire
-from sparsestreet.serving.cameras import NotServedError, Pose, Rig, lens_of, matrix, posed, rig_of
+from sparsestreet.serving.cameras import NotServedError, lens_of, matrix, posed
+from sparsestreet.serving.rig import Pose, Rig, rig_of
 from sparsestreet.types import View
 
 Open = Callable[[Path], StoredScene]

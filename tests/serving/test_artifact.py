@@ -16,8 +16,8 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.nodes import Background, Rigid
 from sparsestreet.scene.views import RecordedViews
 from sparsestreet.serving.artifact import Provenance, write_artifact
-from sparsestreet.serving.cameras import rig_of
 from sparsestreet.serving.renderer import ServedScene, edits_of, picture, view_of
+from sparsestreet.serving.rig import rig_of
 from sparsestreet.types import Shutter
 from tests.export.street import stored_street, street_views
 from tests.scene.street import background, random_rows

@@ -9,7 +9,7 @@ import torch
 from sparsestreet.geometry.cameras import inverse
 from sparsestreet.records.run import RIG, RigRecord
 from sparsestreet.scene.views import RecordedViews
-from sparsestreet.serving.cameras import rig_of
+from sparsestreet.serving.rig import rig_of
 from tests.export.street import street_views
 from tests.serving.street import START_US, STEP_US, at, timed_views, world_from_camera
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from sparsestreet.export.sweeps import Mounted
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.scene.views import RecordedViews
-    from sparsestreet.serving.cameras import Rig
+    from sparsestreet.serving.rig import Rig
     from sparsestreet.types import View
 
 
@@ -279,7 +279,7 @@ def _mounted(
     from sparsestreet.geometry.cameras import inverse
     from sparsestreet.scene.storage import rig_record
     from sparsestreet.scene.views import seconds_of
-    from sparsestreet.serving.cameras import rig_of
+    from sparsestreet.serving.rig import rig_of
 
     record = rig_record(request.scene)
     rig = rig_of(views, record, frame_rate=log_fps)
