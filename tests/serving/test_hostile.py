@@ -1,7 +1,6 @@
 """A thousand requests that nobody should send: each gets a status, and the server draws on as if there were none."""
 
 import random
-from collections.abc import Iterator
 from typing import Any
 
 import grpc
@@ -9,12 +8,8 @@ import numpy as np
 import pytest
 from google.protobuf.message import DecodeError
 
-from sparsestreet.scene.storage import load_scene
 from sparsestreet.serving import wire
-from sparsestreet.serving.renderer import Scenes, named_runs
-from sparsestreet.serving.server import start
-from tests.serving.client import Client
-from tests.serving.street import as_sent, at, place, request_for, timed_views, write_run
+from tests.serving.street import as_sent, at, place, request_for, timed_views
 from tests.serving.test_server import decoded, picture, rendered
 
 COUNT = 1000
@@ -23,16 +18,6 @@ WHOLE = (0, 1, 7, 8193, 10**6, 2**31 - 1, 2**32 - 1)
 """Of sizes, enums and instants; no side between, which would take seconds to draw."""
 STRINGS = ("", "*", "elsewhere", "../../etc/passwd", "str\x00eet", "\x1b[2J", "x" * 100_000, "sträße")
 ALLOWED = {"OK", "INVALID_ARGUMENT", "NOT_FOUND", "UNIMPLEMENTED", "RESOURCE_EXHAUSTED"}
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory) -> Iterator[Client]:
-    runs = named_runs([write_run(tmp_path_factory.mktemp("runs") / "street")])
-    server, port = start(Scenes(runs, load_scene, memory=10**9), "127.0.0.1", 0, workers=2)
-    made = Client(port)
-    yield made
-    made.channel.close()
-    server.stop(None).wait()
 
 
 def fields_of(message: Any) -> list[tuple[Any, Any]]:

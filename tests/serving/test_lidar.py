@@ -1,7 +1,6 @@
 """Sweeps over the wire: what Python draws, byte for byte; where objects are placed; and what is refused."""
 
 import random
-from collections.abc import Iterator
 from typing import Any
 
 import grpc
@@ -12,31 +11,18 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from sparsestreet.data.lidar_models import lidar_model
 from sparsestreet.scene.edits import Edits
-from sparsestreet.scene.storage import load_scene
 from sparsestreet.scene.sweeps import Returns, render_sweep
 from sparsestreet.serving import wire
 from sparsestreet.serving.cameras import pose_message
 from sparsestreet.serving.lidar import lidar_message, sweep, turn_of
-from sparsestreet.serving.renderer import Scenes, named_runs
-from sparsestreet.serving.server import start
 from tests.export.street import stored_street
-from tests.serving.client import Client, pb2, theirs
-from tests.serving.street import START_US, STEP_US, at, place, served, write_run
+from tests.serving.client import pb2, theirs
+from tests.serving.street import START_US, STEP_US, at, place, served
 from tests.serving.test_hostile import ALLOWED, spoil
 
 TURN_US = 100_000
 FROM, TO = at(2.0, 0.2, 1.7, yaw=0.1), at(3.5, 0.3, 1.8, yaw=0.2)
 END = 2 * STEP_US + START_US
-
-
-@pytest.fixture(scope="module")
-def client(tmp_path_factory) -> Iterator[Client]:
-    runs = named_runs([write_run(tmp_path_factory.mktemp("runs") / "street")])
-    server, port = start(Scenes(runs, load_scene, memory=10**9), "127.0.0.1", 0, workers=2)
-    made = Client(port)
-    yield made
-    made.channel.close()
-    server.stop(None).wait()
 
 
 def request_for(start_pose: np.ndarray = FROM, end_pose: np.ndarray = TO, **changes: Any) -> Any:
