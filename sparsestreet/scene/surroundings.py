@@ -204,7 +204,7 @@ class _Stack:
 def _of_cells(nodes: Bool[np.ndarray, "k k k"]) -> tuple[Bool[np.ndarray, "c c c"], Bool[np.ndarray, "c c c"]]:
     """Return whether all, and whether any, of the eight corners of each cell are true."""
     corners = np.lib.stride_tricks.sliding_window_view(nodes, (2, 2, 2))
-    return corners.all((3, 4, 5)), corners.any((3, 4, 5))
+    return np.asarray(corners.all((3, 4, 5))), np.asarray(corners.any((3, 4, 5)))
 
 
 def _touched(image: DepthImage, voxel: float) -> Int64[np.ndarray, "b 3"]:

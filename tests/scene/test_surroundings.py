@@ -1,6 +1,6 @@
 """Surfaces that are known, seen from several sides of a turned world far from its zero."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -63,7 +63,7 @@ def camera(place: np.ndarray, at: np.ndarray, size: tuple[int, int] = (90, 70)) 
     return Camera(inverse(torch.from_numpy(pose)).float(), intrinsics, width, height)
 
 
-def depth_image(place: list[float], at: list[float], *shapes: Depth) -> DepthImage:
+def depth_image(place: Sequence[float], at: Sequence[float], *shapes: Depth) -> DepthImage:
     made = camera(np.array(place), np.array(at))
     row, column = np.mgrid[: made.height, : made.width] + 0.5
     rays = np.linalg.inv(made.intrinsics.double().numpy()) @ np.stack([column, row, np.ones_like(row)]).reshape(3, -1)
