@@ -60,7 +60,7 @@ def run_sweeps(scenes: Sequence[Path], lidars: Sequence[str], repeats: int, file
     """Time every lidar in every scene; each record is on disk at once. Raises FileNotFoundError without a scene."""
     for scene in scenes:
         stored, recorded = load_scene(scene), views_of(scene)
-        least = min(view.camera_index for view in recorded.all)
+        least = min(view.indices[1] for view in recorded.all)
         front = sorted((view for view in recorded.all if view.camera_index == least), key=lambda view: view.time)
         for lidar in lidars:
             way = along_camera(lidar_model(lidar), front, seconds_of(recorded, 10.0))
