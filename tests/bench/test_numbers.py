@@ -1,26 +1,10 @@
-"""The small formulas of the measurements: fronts, spreads and errors, against cases computed by hand."""
+"""The small formulas of the measurements: spreads and errors, against cases computed by hand."""
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sparsestreet.bench.accuracy import GradientError, gradient_error, image_error
-from sparsestreet.bench.figures import pareto_front
 from sparsestreet.bench.timing import TimingBudget, spread
-
-
-@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
-def test_front_is_what_nothing_dominates(points):
-    points = [(float(a), float(b)) for a, b in points]
-
-    def dominated(point: tuple[float, float]) -> bool:
-        return any(other[0] <= point[0] and other[1] <= point[1] and other != point for other in points)
-
-    front = pareto_front(points)
-    assert {points[index] for index in front} == {point for point in points if not dominated(point)}
-    assert [points.index(points[index]) for index in front] == front  # of equal points the first
-    assert [points[index][0] for index in front] == sorted(points[index][0] for index in front)
 
 
 def test_spread_by_hand():

@@ -83,7 +83,7 @@ SLIPS = [
     ("evaluate", "novel=1,0", 2, "novel"),
     ("evaluate", "presets=fast,quick", 2, "no settings preset 'quick': choose one of"),
     ("report", "basline=plain", 2, "no key 'basline'; did you mean 'baseline'?"),
-    ("report", "sections=none", 2, "sections must be one of scenes, mean, all, got 'none'"),
+    ("report", "figure=a.png", 2, "the figure is of a sweep: say sweep=DIR"),
     ("report", "sweep=x", 2, "name folders of runs, or sweep=DIR"),
     ("presets", "nerf", 2, "no method=nerf of DriveStudio: choose one of 3dgs, deformgs, omnire, pvg, streetgs"),
     ("presets", "pvg preset=drivestudio_legacy", 2, "choose one of omnire, streetgs"),
