@@ -1,0 +1,89 @@
+"""A removal that asks what depth would lose: against closed forms, and where color has nothing to say."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from sparsestreet.pruning import LeaveOneOutRule
+from sparsestreet.pruning.ranges import depth_changes, depth_costs
+from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.types import Frame
+from tests.pruning.test_rules import CONTEXT, frame_of, scene_of
+
+OPACITIES, DEPTHS = [0.6, 0.5, 0.9], [4.0, 4.2, 4.5]
+PIXELS = 63
+"""Of the image; every disc covers all of them evenly."""
+
+
+def turned(scene: SceneGraph, frame: Frame) -> tuple[SceneGraph, Frame]:
+    """The same view of the same discs in a world that is turned and shifted."""
+    angle = math.radians(100)
+    world_from_old = torch.eye(4)
+    world_from_old[:3, :3] = torch.tensor(
+        [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]]
+    )
+    world_from_old[:3, 3] = torch.tensor([30.0, -7.0, 12.0])
+    rows = scene.nodes["background"].rows
+    with torch.no_grad():
+        rows.means.copy_(rows.means @ world_from_old[:3, :3].T + world_from_old[:3, 3])
+    pose = frame.camera.camera_from_world @ torch.linalg.inv(world_from_old)
+    return scene, replace(frame, camera=replace(frame.camera, camera_from_world=pose))
+
+
+def inverse_depth(opacities: list[float], depths: list[float] = DEPTHS) -> float:
+    """Of a pixel, by hand: what discs show, front to back."""
+    through, summed = 1.0, 0.0
+    for opacity, z in zip(opacities, depths, strict=True):
+        summed, through = summed + through * opacity / z, through * (1 - opacity)
+    return summed
+
+
+def test_changes_of_depth_are_those_of_the_view_without_each_row():
+    """With a number of its own for each of the rules of a pixel: none recorded, too near, too far, wrong, right."""
+    drawn = inverse_depth(OPACITIES)
+    depth = torch.zeros(7, 9)
+    depth[1, 2], depth[3, 4], depth[3, 5] = 1.05 / drawn, 0.97 / drawn, 1.0 / drawn
+    depth[5, 5], depth[5, 6], depth[6, 0], depth[6, 1] = 1.11 / drawn, 0.89 / drawn, 0.4, 81.0
+    scene = scene_of(OPACITIES, DEPTHS)
+    scene.nodes["background"].rows.log_scales.data.fill_(6.0)  # flat to 1e-6 across the image
+    scene, frame = turned(scene, replace(frame_of(scene, 20), depth=depth))
+    with torch.no_grad():
+        error, changes = depth_changes(scene, frame, frame.depth, CONTEXT)
+    right = [1.05, 0.97, 1.0]
+    assert float(error) == pytest.approx(sum((one - 1) ** 2 for one in right), rel=1e-3)  # of float32's 1e-7 of 0.03
+    for row, change in enumerate(changes.tolist()):
+        without = inverse_depth([0.0 if one == row else opacity for one, opacity in enumerate(OPACITIES)])
+        expected = sum((one * (1 - without / drawn)) ** 2 for one in right)
+        assert change == pytest.approx(expected, rel=1e-4)
+
+
+def test_where_images_miss_neither_the_depth_says_which_of_two_stays():
+    """A wall, and one of its own color behind it: either shows all images."""
+    scene = scene_of([0.999, 0.999], [8.0, 4.0])
+    frame = replace(frame_of(scene, 20), depth=torch.full((7, 9), 4.0))
+    without = replace(frame, frame_index=1, depth=None)
+    # The op lets a hundredth of the light through, so three steps of 255 count as none.
+    rule = LeaveOneOutRule(0.1, noticeable=3 / 255, keep=0.5)
+    for depth, kept in ((0.0, [True, False]), (1.0, [False, True])):
+        selection = replace(rule, depth=depth).select(scene, [without, frame, without], CONTEXT)["background"]
+        assert selection.keep.tolist() == kept
+
+
+def test_the_budget_is_of_images_alone():
+    """The depth's order, far rows last; the first row that images miss by more than is allowed ends the removal."""
+    scene = scene_of([0.05, 0.3, 0.1], [2.0, 3.0, 4.0])
+    frame = replace(frame_of(scene, 20), depth=torch.full((7, 9), 1 / inverse_depth([0.05, 0.3, 0.1], [2.0, 3.0, 4.0])))
+    costs = LeaveOneOutRule(0.1).costs(scene, [frame], CONTEXT)["background"]
+    of_depth = depth_costs(scene, [frame], CONTEXT)["background"]
+    assert costs.argsort().tolist() == [0, 2, 1]
+    assert of_depth.argsort().tolist() == [2, 0, 1]
+    for allowed, kept in ((0.99 * costs[2], [True, True, True]), (1.01 * costs[2], [True, True, False])):
+        rule = LeaveOneOutRule(10 * math.log10(1 + float(allowed)), depth=1e6)
+        assert rule.select(scene, [frame], CONTEXT)["background"].keep.tolist() == kept
+
+
+def test_a_log_without_lidar_is_asked_for_images_alone():
+    scene = scene_of(OPACITIES, DEPTHS)
+    assert depth_costs(scene, [frame_of(scene, 20)], CONTEXT)["background"].tolist() == [0.0, 0.0, 0.0]
