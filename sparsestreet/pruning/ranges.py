@@ -20,14 +20,11 @@ RIGHT = 0.1
 """Share of the recorded depth up to which a drawn one is right. What is wrong anyway has nothing to lose, and a few
 returns that went through a window or past an edge would outweigh all others."""
 
-
 MIN_ERROR = 1e-12
 """Squared error, relative to the depth, that stands for no error."""
 
 
-def depth_costs(
-    scene: SceneGraph, frames: Sequence[Frame], context: RenderContext
-) -> dict[str, Float64[Tensor, " _"]]:
+def depth_costs(scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Float64[Tensor, " _"]]:
     """Return name of a node -> the squared change of depth without each of its rows, relative to the present error."""
     error = torch.zeros((), dtype=torch.float64, device=scene.device)
     changes = error.new_zeros(sum(scene.counts().values()))
@@ -42,7 +39,7 @@ def depth_costs(
 def depth_changes(
     scene: SceneGraph, view: View, depth: Float[Tensor, "h w"], context: RenderContext
 ) -> tuple[Float64[Tensor, ""], Float64[Tensor, " n"]]:
-    """Return the squared relative error of a view's depth, summed over its right pixels, and its change without each row.
+    """Return the squared relative error of a view's depth, summed over right pixels, and its change without each row.
 
     A row's light is given the brightness 1 / z. The drawn image is then the inverse depth s of a pixel, with 0 for what
     lies at infinity, and linear in the alpha of each row as colors are. With the recorded depth d the relative error is

@@ -118,9 +118,9 @@ def keep_by_cost(
 ) -> dict[str, Selection]:
     """Drops the rows of all nodes together, lowest ``order`` first, while their costs add up to ``allowed`` at most.
 
-    ``costs``, ``floors`` and ``order`` (None: the costs) are by name of the node. At a floor the rows that would go last
-    stay and, among equals, the lower row; their cost is not spent on others. Raises ValueError for costs or an order
-    that are NaN or negative, or a negative floor.
+    ``costs``, ``floors`` and ``order`` (None: the costs) are by name of the node. At a floor the rows that would go
+    last stay and, among equals, the lower row; their cost is not spent on others. Raises ValueError for costs or an
+    order that are NaN or negative, or a negative floor.
 
     >>> costs = {"road": torch.tensor([0.1, 0.5]), "cars": torch.tensor([0.2])}
     >>> kept = keep_by_cost(costs, allowed=0.4, floors={"road": Floors(0), "cars": Floors(0)})
@@ -147,7 +147,7 @@ def keep_by_rank(
     >>> keep_by_rank({"road": torch.tensor([0.1, 0.5])}, number=1, floors={"road": Floors(0)})["road"].keep.tolist()
     [False, True]
     """
-    everything = torch.cat([score.double() for score in scores.values()]) if scores else torch.zeros(0, dtype=torch.float64)
+    everything = torch.cat([score.double() for score in scores.values()]) if scores else torch.zeros(0).double()
     if not 0 <= number <= len(everything):
         raise ValueError(
             f"{number:,} rows are to go, and the nodes that the rule may take from have {len(everything):,}: take "
