@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from sparsestreet.data.lazy import as_frames
 from sparsestreet.geometry.cameras import transform_points
 from sparsestreet.ops import leave_one_out, splat
 from sparsestreet.ops.spherical_harmonics import of_colors
@@ -25,7 +26,16 @@ MIN_ERROR = 1e-12
 
 
 def depth_costs(scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Float64[Tensor, " _"]]:
-    """Return name of a node -> the squared change of depth without each of its rows, relative to the present error."""
+    """Return name of a node -> the squared change of depth without each of its rows, relative to the present error.
+
+    Of p passes each asks every p-th instant, in turn: neighbors show the same surfaces, and no training step has drawn
+    what is asked here.
+    """
+    frames = as_frames(frames)
+    turns = {
+        instant: place % context.passes for place, instant in enumerate(sorted({v.indices[0] for v in frames.views}))
+    }
+    frames = frames.where(lambda view: turns[view.indices[0]] == context.passed % context.passes)
     error = torch.zeros((), dtype=torch.float64, device=scene.device)
     changes = error.new_zeros(sum(scene.counts().values()))
     for frame in on_device(scene, frames, context.ranks):

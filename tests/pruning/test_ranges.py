@@ -82,6 +82,23 @@ def test_costs_are_of_all_views_together():
     torch.testing.assert_close(depth_costs(scene, frames, CONTEXT)["background"], expected, rtol=1e-12, atol=0.0)
 
 
+def test_passes_ask_each_instant_once_all_its_cameras_together():
+    """Two cameras that fire together, instants with gaps: passes of two have 2, 9 and 5, 11."""
+    scene = scene_of(OPACITIES, DEPTHS)
+    shown = [(11, 0), (2, 0), (2, 1), (5, 0), (5, 1), (9, 1)]
+    frames = [
+        replace(
+            frame_of(scene, 20), frame_index=instant, camera_index=camera, depth=torch.full((7, 9), 4.0 + 0.01 * place)
+        )
+        for place, (instant, camera) in enumerate(shown)
+    ]
+    for passed, places in ((0, [1, 2, 5]), (1, [0, 3, 4])):
+        chosen = [frames[place] for place in places]
+        expected = depth_costs(scene, chosen, CONTEXT)["background"]
+        found = depth_costs(scene, frames, replace(CONTEXT, passes=2, passed=passed))["background"]
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=0.0)
+
+
 def test_where_images_miss_neither_the_depth_says_which_of_two_stays():
     """A wall, and one of its own color behind it: either shows all images."""
     scene = scene_of([0.999, 0.999], [8.0, 4.0])
