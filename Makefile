@@ -71,9 +71,7 @@ demo: $(VENV)/.ok ## a synthetic street, trained plain and pruned: one table, pi
 	$(BIN)/sparsestreet demo
 
 bench: $(VENV)/.ok ## what accuracy costs in time: records and figures
-	$(BIN)/sparsestreet bench blend
 	$(BIN)/sparsestreet bench settings
-	$(BIN)/sparsestreet bench scaling
 
 # Two runs beside each other, a thread each; what stands is skipped. What fails stands in the tables.
 TRAIN := OMP_NUM_THREADS=1 $(BIN)/sparsestreet train hydra/launcher=joblib hydra.launcher.n_jobs=2

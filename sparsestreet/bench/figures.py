@@ -11,6 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from sparsestreet.report.figures import front as pareto_front
+
 Record = dict[str, Any]
 """A line of a file of records, as JSON has it."""
 PlottedPoint = tuple[float, float, Record]
@@ -89,19 +91,6 @@ def gradient_l2(record: Record) -> float:
     return math.inf if None in values else max(MIN_ERROR, *values)
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the points (cost, error) that are not dominated, by rising cost.
-
-    A point is dominated if another is no worse in both and better in one. Of equal points the first is kept.
-    """
-    front, least = [], float("inf")
-    for index in sorted(range(len(points)), key=lambda i: points[i]):
-        if points[index][1] < least:
-            front.append(index)
-            least = points[index][1]
-    return front
-
-
 def _pareto_figure(
     measured: Sequence[Record],
     cost: Callable[[Record], float],
@@ -147,7 +136,8 @@ def _legend(place: Axes, panels: Sequence[Axes]) -> None:
 def _pareto_panel(axes: Axes, points: Sequence[PlottedPoint]) -> list[PlottedPoint]:
     """Draw a scene; return the points to be named: presets and the front."""
     own = [point for point in points if not point[2]["other_model"]]
-    front = [own[index] for index in pareto_front([point[:2] for point in own])]
+    first = {point[:2]: point for point in reversed(own)}
+    front = [first[cost, -gain] for cost, gain in pareto_front([(cost, -error) for cost, error in first])]
     x, y = [point[0] for point in front], [point[1] for point in front]
     axes.plot(x, y, color="0.6", linewidth=1.2, drawstyle="steps-post", label="Pareto front", zorder=1)
     for knob, hollow in dict.fromkeys((point[2]["knob"], point[2]["other_model"]) for point in points):

@@ -18,7 +18,6 @@ from lightning import Callback, Trainer
 from matplotlib.figure import Figure
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from sparsestreet.bench.blend import BACKWARD_FLOPS, FORWARD_FLOPS, measured_peak
 from sparsestreet.bench.figures import save_figure
 from sparsestreet.bench.records import RecordFile
 from sparsestreet.bench.timing import TimeSpread, spread
@@ -29,6 +28,8 @@ from sparsestreet.scene.rendering import SceneRendering
 from sparsestreet.training.callbacks.times import LOOP
 from sparsestreet.training.system import StreetSystem
 
+FORWARD_FLOPS, BACKWARD_FLOPS = 36, 65
+"""Operations per (splat, pixel) sample of one color blend, and of its gradient."""
 NUMBER = 4.0
 """Bytes of a float32."""
 _SHAPE_NUMBERS = 11
@@ -122,14 +123,24 @@ def measured_bandwidth(device: torch.device, megabytes: int = 256) -> float:
     It is in place because a copy also reads what it overwrites, which the count of bytes would miss.
     """
     values = torch.zeros(megabytes << 18, device=device)
+    return 2 * NUMBER * values.numel() / _least_seconds(lambda: values.add_(1.0), device)
+
+
+def measured_peak(device: torch.device, size: int = 2048) -> float:
+    """float32 operations per second of a matrix product, the best of several."""
+    a, b = torch.randn(size, size, device=device), torch.randn(size, size, device=device)
+    return 2 * size**3 / _least_seconds(lambda: a @ b, device)
+
+
+def _least_seconds(call: Callable[[], object], device: torch.device) -> float:
     seconds = []
     for _ in range(6):
         start = time.perf_counter()
-        values.add_(1.0)
+        call()
         if device.type == "cuda":
             torch.cuda.synchronize(device)
         seconds.append(time.perf_counter() - start)
-    return 2 * NUMBER * values.numel() / min(seconds)
+    return min(seconds)
 
 
 @dataclass(frozen=True)

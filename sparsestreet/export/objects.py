@@ -14,8 +14,7 @@ from jaxtyping import Float64, UInt8
 from sparsestreet.atomic import atomic_folder
 from sparsestreet.data.lazy import spread
 from sparsestreet.export.frame import selected, turned
-from sparsestreet.export.plain import plain_factors, spread_cameras
-from sparsestreet.export.ply import scene_gaussians, write_ply
+from sparsestreet.export.ply import plain_factors, scene_gaussians, spread_cameras, write_ply
 from sparsestreet.export.shapes import object_hull
 from sparsestreet.geometry.cameras import project
 from sparsestreet.geometry.meshes import ply_bytes

@@ -13,8 +13,7 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from sparsestreet.export.path import CameraPath, Rig
-from sparsestreet.export.plain import plain_factors
-from sparsestreet.export.ply import check_gaussians
+from sparsestreet.export.ply import check_gaussians, plain_factors
 from sparsestreet.finite import check_finite
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.cameras import project

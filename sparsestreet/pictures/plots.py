@@ -17,7 +17,6 @@ from sparsestreet.records.run import RUN
 
 # Okabe and Ito's palette: distinguishable with any color vision.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-_MARKERS = "osD^vP*"  # one fewer than colors, so that pairs of both repeat late
 _DASHES = ("--", ":", "-.")
 _MAX_FULL_TICKS = 300
 """Ratio of the ends of an axis below which 2 and 5 times a power of ten have labels."""
@@ -70,27 +69,6 @@ def plot_psnr(
     for index, (name, (steps, values)) in enumerate(curves.items()):
         axes.plot(steps, values, label=name, **_line(index))
     _mark(axes, events)
-    _finish(figure, axes, path)
-
-
-def plot_runs(path: Path, points: Mapping[str, Sequence[tuple[int, float]]]) -> None:
-    """Draw every run as a point; ``points``: name of a variant -> (Gaussians, held-out PSNR in dB) of its runs."""
-    figure, axes = _figure("Quality against size", "Gaussians", "held-out PSNR, full image (dB)")
-    for index, (name, runs) in enumerate(points.items()):
-        gaussians, psnr = zip(*runs, strict=True)
-        axes.scatter(
-            gaussians,
-            psnr,
-            color=_COLORS[index % len(_COLORS)],
-            marker=_MARKERS[index % len(_MARKERS)],
-            s=46,
-            alpha=0.85,
-            label=f"{name} (n={len(runs)})",
-        )
-    axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
-    axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: _short(value)))
-    axes.tick_params(axis="x", which="minor", labelsize=7)
     _finish(figure, axes, path)
 
 

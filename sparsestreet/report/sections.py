@@ -3,14 +3,12 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import pandas as pd
 from rich.table import Table
 from rich.text import Text
 
 from sparsestreet.metrics.definitions import DRIVESTUDIO, LIDAR_REACH, Protocol
-from sparsestreet.pictures.plots import plot_runs
 from sparsestreet.records.configuration import Setting, config_hash, differing_options, without
 from sparsestreet.records.run import CodeVersion, Machine
 from sparsestreet.records.summary import HELD_OUT, TRAINING, RunSummary
@@ -510,23 +508,6 @@ def sections_markdown(sections: Sequence[Section]) -> str:
         notes = "\n".join(f"- {note}" for note in section.notes)
         blocks.append(f"### {section.title}\n\n{table}\n\n{notes}\n")
     return "\n".join(blocks)
-
-
-def size_figure(records: Sequence[RunRecord], path: Path) -> None:
-    """Write a scatter of all runs: PSNR of held-out views against Gaussians, one color for each variant.
-
-    Raises ValueError if no run has held-out views.
-    """
-    runs = [record.summary for record in records]
-    points = {
-        variant.name: [
-            (run.gaussians_total, psnr) for run in variant.runs if (psnr := run.mean("psnr_full", HELD_OUT)) is not None
-        ]
-        for variant in repeats(runs)
-    }
-    if not any(points.values()):
-        raise ValueError("no run was evaluated on held-out views, which the figure shows: train with split.stride > 0")
-    plot_runs(path, {name: some for name, some in points.items() if some})
 
 
 def _drawn(section: Section, width: int) -> list[Table | Text]:

@@ -10,7 +10,7 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
-from sparsestreet.bench import figures, scaling
+from sparsestreet.bench import figures
 from sparsestreet.bench.figures import (
     _sparse,
     _steps,
@@ -21,7 +21,6 @@ from sparsestreet.bench.figures import (
     save_figure,
     whole_time,
 )
-from sparsestreet.bench.scaling import Line
 from tests.typed import as_a
 
 
@@ -49,10 +48,9 @@ RECORDS = [
 @pytest.fixture
 def saved(monkeypatch) -> dict[str, Figure]:
     drawn: dict[str, Figure] = {}
-    for module in (figures, scaling):
-        monkeypatch.setattr(
-            module, "save_figure", lambda figure, folder, name: drawn.update({name: figure}) or [folder / name]
-        )
+    monkeypatch.setattr(
+        figures, "save_figure", lambda figure, folder, name: drawn.update({name: figure}) or [folder / name]
+    )
     return drawn
 
 
@@ -138,26 +136,6 @@ def test_marks_of_an_axis_are_1_2_and_5():
     assert [_sparse(value, 0) for value in (0.1, 0.2, 0.3, 1.0, 5.0, 30.0, 200.0)] == [
         *("0.1", "0.2", "", "1", "5", "", "200"),
     ]
-
-
-def test_times_against_pairs_with_their_lines(saved, tmp_path):
-    work, times = [100.0, 1000.0], {"forward": [2.0, 11.0], "backward": [5.0, 32.0]}
-    lines = {"forward": Line(0.01, 1.0, 0.99), "backward": Line(0.03, 2.0, 0.98)}
-    assert scaling.draw_scaling(work, times, lines, tmp_path) == [tmp_path / "scaling"]
-    (axes,) = saved["scaling"].axes
-    for line, (name, values), dots in zip(axes.get_lines(), times.items(), axes.collections, strict=True):
-        x, y = (np.asarray(part) for part in line.get_data())
-        assert (x[0], x[-1], len(x)) == pytest.approx((100.0, 1000.0, 61))
-        assert np.allclose(np.diff(np.log(x)), math.log(10) / 60)
-        assert y == pytest.approx(lines[name].intercept + lines[name].slope * x)
-        assert dots.get_offsets().tolist() == [list(pair) for pair in zip(work, values, strict=True)]
-        assert to_hex(dots.get_facecolor()[0]) == str(line.get_color()).lower()
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
-        "forward: 1 ms + 1e+04 ns a pair, R² = 0.9900",
-        "backward: 2 ms + 3e+04 ns a pair, R² = 0.9800",
-    ]
-    assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("(splat, tile) pairs", "median time, ms")
 
 
 def test_a_figure_is_saved_twice_and_the_same_again(tmp_path):

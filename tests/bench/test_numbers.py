@@ -1,44 +1,10 @@
-"""The small formulas of the measurements: lines, fronts, spreads and errors, against cases computed by hand."""
+"""The small formulas of the measurements: spreads and errors, against cases computed by hand."""
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
 from sparsestreet.bench.accuracy import GradientError, gradient_error, image_error
-from sparsestreet.bench.figures import pareto_front
-from sparsestreet.bench.scaling import fit_line
 from sparsestreet.bench.timing import TimingBudget, spread
-
-
-def test_line_by_hand():
-    # Weights 1, 1, 1/4 (of 9/4): means 2/3 and 10/9, covariance 4/27, variance of x 4/9: slope 1/3, intercept 8/9.
-    # Residuals 1/9, -2/9, 4/9: weighted (1 + 4 + 4) / 81 / (9/4) = 4/81, half of the variance of y, 8/81.
-    line = fit_line([0.0, 1.0, 2.0], [1.0, 1.0, 2.0])
-    assert (line.slope, line.intercept) == pytest.approx((1 / 3, 8 / 9))
-    assert line.r_squared == pytest.approx(1 / 2)
-    assert line.at(10.0) == pytest.approx(38 / 9)
-
-
-def test_line_of_constant_values_and_of_one_x():
-    assert fit_line([1.0, 2.0], [3.0, 3.0]).r_squared == 1
-    with pytest.raises(ValueError, match=r"two different x, got \[4"):
-        fit_line([4.0, 4.0], [1.0, 2.0])
-    with pytest.raises(ValueError, match=r"values > 0, got 0"):
-        fit_line([4.0, 5.0], [0.0, 2.0])
-
-
-@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
-def test_front_is_what_nothing_dominates(points):
-    points = [(float(a), float(b)) for a, b in points]
-
-    def dominated(point: tuple[float, float]) -> bool:
-        return any(other[0] <= point[0] and other[1] <= point[1] and other != point for other in points)
-
-    front = pareto_front(points)
-    assert {points[index] for index in front} == {point for point in points if not dominated(point)}
-    assert [points.index(points[index]) for index in front] == front  # of equal points the first
-    assert [points[index][0] for index in front] == sorted(points[index][0] for index in front)
 
 
 def test_spread_by_hand():

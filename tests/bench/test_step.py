@@ -24,6 +24,7 @@ from sparsestreet.bench.step import (
     floors,
     lines,
     measured_bandwidth,
+    measured_peak,
     run_step,
 )
 from sparsestreet.bench.timing import TimeSpread
@@ -85,8 +86,12 @@ def test_the_slower_of_memory_and_arithmetic_decides():
     assert Floor(8.0, 1.0).seconds(4.0, 1.0) == pytest.approx(2.0)
 
 
-def test_bandwidth_is_measured():
-    assert 1e8 < measured_bandwidth(torch.device("cpu"), megabytes=4) < 1e13
+def test_bandwidth_and_peak_are_the_best_of_several(monkeypatch):
+    """On a clock of which six calls take 2, 0.5, 1, 1, 1 and 4 seconds."""
+    ticks = iter(2 * [0.0, 2.0, 2.0, 2.5, 3.0, 4.0, 4.0, 5.0, 5.0, 6.0, 6.0, 10.0])
+    monkeypatch.setattr(step.time, "perf_counter", lambda: next(ticks))
+    assert measured_bandwidth(torch.device("cpu"), megabytes=4) == 2 * 4 * 2**20 / 0.5
+    assert measured_peak(torch.device("cpu"), size=4) == 2 * 64 / 0.5
 
 
 def test_a_window_of_a_run_is_timed_then_counted(monkeypatch):

@@ -13,10 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.cli.commands import evaluate as evaluate_module
 from sparsestreet.cli.commands.evaluate import evaluate
-from sparsestreet.cli.config.compose import resolved
+from sparsestreet.cli.config.compose import resolved, with_images
 from sparsestreet.cli.runs import run as run_module
 from sparsestreet.cli.runs import run as step_module
-from sparsestreet.cli.runs.run import NEVER, data_of, recipe_of, run, train_with, with_images
+from sparsestreet.cli.runs.run import NEVER, data_of, recipe_of, run, train_with
 from sparsestreet.data.synthetic.reader import StreetReader
 from sparsestreet.evaluation.extra import ExtraMetrics
 from sparsestreet.evaluation.speed import Timing

@@ -1,28 +1,19 @@
 """``sparsestreet bench``: modes, help, and the street of a run."""
 
-import json
+import shlex
 from pathlib import Path
 
 import pytest
 import torch
 
-from sparsestreet.bench import blend, figures, scaling, scenes, settings_sweep, step
-from sparsestreet.bench.scenes import Size
-from sparsestreet.bench.timing import TimingBudget
+from sparsestreet.bench import figures, scenes, settings_sweep, step
+from sparsestreet.bench.records import read_records
 from sparsestreet.cli.commands import bench as cli_bench
 from sparsestreet.cli.commands.bench import bench, trained_street
 from sparsestreet.cli.runs import run as cli_step
 from sparsestreet.scene.storage import load_scene
 from sparsestreet.scene.views import read_views
 from tests.export.street import write_street
-
-
-def test_records_name_command_and_threads(tmp_path, capsys):
-    assert bench(["scaling", "quick=true", f"out={tmp_path}", f"threads={torch.get_num_threads()}"]) == 0
-    first = json.loads((tmp_path / "scaling.jsonl").read_text().splitlines()[0])
-    assert first["provenance"]["command"].startswith("sparsestreet bench scaling quick=true")
-    assert first["provenance"]["threads"] == torch.get_num_threads()
-    assert first["rows"] < min(scaling.ROWS)
 
 
 @pytest.fixture
@@ -34,8 +25,6 @@ def handed(monkeypatch):
         monkeypatch.setattr(module, name, lambda *args, **named: given.update({name: (args, named)}))
 
     replaced(settings_sweep, "run_sweep")
-    replaced(blend, "run_blend")
-    replaced(scaling, "run_scaling")
     replaced(step, "run_step")
     monkeypatch.setattr(
         figures, "draw_pareto", lambda records, folder: given.update(drawn=(records, folder)) or ["a.svg"]
@@ -45,7 +34,6 @@ def handed(monkeypatch):
     return given
 
 
-TRIAL = TimingBudget(repeats=2, least=1)
 SMALL = ("scenes", settings_sweep.SMALL)
 
 
@@ -56,10 +44,6 @@ SMALL = ("scenes", settings_sweep.SMALL)
          (("scenes", settings_sweep.FULL, None), SMALL, settings_sweep.points(), settings_sweep.BUDGET)),
         (["quick=true", "street=RUN"], "run_sweep",
          (("scenes", settings_sweep.QUICK, "the street"), SMALL, settings_sweep.points(), settings_sweep.QUICK_BUDGET)),
-        (["blend"], "run_blend", (blend.MAIN, blend.TRAINING, TimingBudget(20, 10.0, 3), TimingBudget(3, 10.0, 3))),
-        (["blend", "quick=true"], "run_blend", (Size(64, 48, 300), [Size(48, 32, 200)], TRIAL, TRIAL)),
-        (["scaling"], "run_scaling", (scaling.ROWS, scaling.LARGE, TimingBudget(seconds=15.0, least=5))),
-        (["scaling", "quick=true"], "run_scaling", ((200, 400, 800), None, TRIAL)),
         (["step", "seed=3"], "run_step", ("train seed=3", "trains", step.FULL)),
         (["step", "seed=3", "quick=true"], "run_step", ("train seed=3", "trains", step.QUICK)),
     ],
@@ -75,7 +59,11 @@ def test_a_mode_hands_on_what_it_is_told(handed, monkeypatch, tmp_path, words, n
     mode = words[0] if "=" not in words[0] else "settings"
     file, *folder = args[len(expected) :]
     assert file.path == tmp_path / "o" / f"{mode}.jsonl"
-    assert folder == ([tmp_path / "o"] if mode in ("scaling", "step") else [])
+    file.write("anything", step.Floor(1.0))
+    (record,) = read_records(file.path)
+    assert record["provenance"]["command"] == shlex.join(["sparsestreet", "bench", *words, f"out={tmp_path / 'o'}"])
+    assert record["provenance"]["threads"] == torch.get_num_threads()
+    assert folder == ([tmp_path / "o"] if mode == "step" else [])
     assert named == {}
     if mode == "settings":
         assert handed["drawn"] == ([], tmp_path / "o")

@@ -83,13 +83,13 @@ SLIPS = [
     ("evaluate", "novel=1,0", 2, "novel"),
     ("evaluate", "presets=fast,quick", 2, "no settings preset 'quick': choose one of"),
     ("report", "basline=plain", 2, "no key 'basline'; did you mean 'baseline'?"),
-    ("report", "sections=none", 2, "sections must be one of scenes, mean, all, got 'none'"),
+    ("report", "figure=a.png", 2, "the figure is of a sweep: say sweep=DIR"),
     ("report", "sweep=x", 2, "name folders of runs, or sweep=DIR"),
     ("presets", "nerf", 2, "no method=nerf of DriveStudio: choose one of 3dgs, deformgs, omnire, pvg, streetgs"),
     ("presets", "pvg preset=drivestudio_legacy", 2, "choose one of omnire, streetgs"),
-    ("bench", "setting", 2, "mode must be one of settings, blend, step, costs, scaling, got 'setting'"),
-    ("bench", "blend sed=1", 2, "no key 'sed'; there are mode, quick, street, threads, out"),
-    ("bench", "blend street=RUN", 2, "street=RUN is for the modes settings and costs, got blend: leave it out"),
+    ("bench", "setting", 2, "mode must be one of settings, step, got 'setting'"),
+    ("bench", "settings sed=1", 2, "no key 'sed'; there are mode, quick, street, threads, out"),
+    ("bench", "step street=RUN", 2, "street=RUN is for the mode settings, got step: leave it out"),
 ]
 OUT = {"render": ["out=drive.mp4"], "export": ["out=street.ply"]}
 """What is asked for where the words of a slip say no other."""

@@ -10,8 +10,8 @@ from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
-from sparsestreet.cli.config.compose import CONF, configuration, options_of, resolved
-from sparsestreet.cli.runs.run import identity_of, recipe_of, with_images
+from sparsestreet.cli.config.compose import CONF, configuration, options_of, resolved, with_images
+from sparsestreet.cli.runs.run import identity_of, recipe_of
 from sparsestreet.pruning import ImportanceRule, LeaveOneOutRule, LightGaussianRule, MiniSplattingRule
 from sparsestreet.records.configuration import flat_config
 from sparsestreet.training.callbacks import DensityControl, Pruning

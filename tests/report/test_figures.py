@@ -7,6 +7,8 @@ from typing import Any
 import matplotlib.axes
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
@@ -37,9 +39,14 @@ from tests.evaluation.frames import disturbed, make_summary
 from tests.report.sweep_folder import record, write_sweep
 
 
-def test_the_front_is_what_nothing_beats():
-    points = [(1.0, 20.0), (2.0, 19.0), (2.0, 22.0), (3.0, 22.0), (4.0, 23.0)]
-    assert front(points) == [(1.0, 20.0), (2.0, 22.0), (4.0, 23.0)]
+@given(st.lists(st.tuples(st.integers(0, 6), st.integers(0, 6)), max_size=12))
+def test_the_front_is_what_nothing_beats(points):
+    points = [(float(cost), float(quality)) for cost, quality in points]
+
+    def beaten(point: tuple[float, float]) -> bool:
+        return any(other[0] <= point[0] and other[1] >= point[1] and other != point for other in points)
+
+    assert front(points) == sorted({point for point in points if not beaten(point)})
 
 
 @pytest.fixture

@@ -5,7 +5,6 @@ import io
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
@@ -13,7 +12,7 @@ from sparsestreet.metrics.definitions import DEFINITIONS, DRIVESTUDIO, STRICT
 from sparsestreet.records.run import CodeVersion
 from sparsestreet.records.summary import HELD_OUT, Evaluation, MetricSummary
 from sparsestreet.report.collect import RunRecord
-from sparsestreet.report.sections import section_tables, sections, sections_markdown, size_figure
+from sparsestreet.report.sections import section_tables, sections, sections_markdown
 from sparsestreet.report.tables import Spread
 from tests.evaluation.frames import CLEAN, MACHINE, disturbed, make_summary, with_ranges
 from tests.report.sweep_folder import record
@@ -390,21 +389,6 @@ def test_many_variants_are_tables_below_each_other_where_there_is_none():
     assert "…" not in text
     assert text.count("held out:") == 1  # one title
     assert text.count("guards: none fired") == 1
-
-
-def test_every_run_is_a_point_in_its_variants_color(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, path: drawn.append((self, path)))
-    runs = [street(*values) for values in STREETS]
-    size_figure(records(*runs, make_summary("blind", psnr=None, training_psnr=30.0)), tmp_path / "runs.png")
-    ((canvas, path),) = drawn
-    assert path == tmp_path / "runs.png"
-    ours, plain = canvas.axes[0].collections
-    assert plain.get_offsets().tolist() == [[100, 30], [200, 32], [300, 31]]
-    assert ours.get_offsets().tolist() == [[50, 29], [50, 32.5], [150, 30]]
-    assert [text.get_text() for text in canvas.axes[0].get_legend().get_texts()] == ["ours (n=3)", "plain (n=3)"]
-    with pytest.raises(ValueError, match="no run was evaluated on held-out views"):
-        size_figure(records(make_summary(psnr=None, training_psnr=30.0)), tmp_path / "runs.png")
 
 
 def shown(summary, protocol):

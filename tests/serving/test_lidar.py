@@ -1,5 +1,7 @@
 """Sweeps over the wire: what Python draws, byte for byte; where objects are placed; and what is refused."""
 
+import ctypes
+import gc
 import random
 from typing import Any
 
@@ -19,6 +21,7 @@ from tests.export.street import stored_street
 from tests.serving.client import pb2, theirs
 from tests.serving.street import START_US, STEP_US, at, place, served
 from tests.serving.test_hostile import ALLOWED, spoil
+from tests.stress.forked import resident_mb
 
 TURN_US = 100_000
 FROM, TO = at(2.0, 0.2, 1.7, yaw=0.1), at(3.5, 0.3, 1.8, yaw=0.2)
@@ -138,25 +141,74 @@ def test_what_no_lidar_does_is_refused_in_a_line(client, changes, status, said):
     assert "\n" not in str(caught.value.details())
 
 
-@pytest.mark.lengthy
-def test_hostile_requests_leave_the_server_as_it_was(client, caplog):
+MAX_GROWTH = 10.0
+"""MB of server and client together, of what is in use: 1 to 4 are seen. A kept answer has 0.2 MB, kept rays have 10."""
+METHOD = "/nre.grpc.protos.sensorsim.SensorsimService/render_lidar"
+
+
+def anywhere(dice: random.Random) -> np.ndarray:
+    """A pose of any turn, from a millimeter to thousands of kilometers away."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_quat([dice.gauss(0, 1) for _ in range(4)]).as_matrix()
+    pose[:3, 3] = [10.0 ** dice.randint(-3, 6) * dice.gauss(0, 1) for _ in range(3)]
+    return pose
+
+
+def hostile(dice: random.Random) -> bytes:
+    """A message that is spoiled, cut short, changed in some bytes, made of dice, or of poses that no car has."""
+    way = dice.randrange(6)
+    if way == 0:
+        return dice.randbytes(dice.choice((0, 1, 10, 300)))
+    if way == 1:
+        first = anywhere(dice)
+        request = request_for(first, dice.choice((first, anywhere(dice))))
+        place(request, "car", dice.choice((first, anywhere(dice))), anywhere(dice))
+        return request.SerializeToString()
+    request = request_for()
+    place(request, "car", at(9.0, 0.2, 1.0))
+    for _ in range(dice.randint(1, 4)):
+        spoil(request, dice)
+    data = bytearray(request.SerializeToString())
+    if way == 2:
+        return bytes(data[: dice.randrange(len(data))])
+    if way == 3:
+        for _ in range(3):
+            data[dice.randrange(len(data))] = dice.randrange(256)
+    return bytes(data)
+
+
+def used_mb() -> float:
+    """What the process holds once the allocator gave back what it only keeps, which varies by 100 MB."""
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+    return resident_mb()
+
+
+def status_of(client: Any, data: bytes, timeout: float) -> str:
+    try:
+        answer = pb2.LidarRenderReturn.FromString(client.channel.unary_unary(METHOD)(data, timeout=timeout))
+    except grpc.RpcError as error:
+        return error.code().name if len(str(error.details())) <= 1000 else "a long error"
+    assert np.isfinite(points_of(answer)).all()
+    return "OK"
+
+
+@pytest.mark.parametrize(
+    "count", [pytest.param(120, marks=pytest.mark.lengthy), pytest.param(1000, marks=pytest.mark.slow)]
+)
+def test_hostile_requests_leave_the_server_as_it_was(client, caplog, count):
+    """Some are given up at once. Every hundredth is a good one: its answer stays, byte for byte, and so does memory."""
     expected = client.render_lidar(theirs(request_for())).point_xyzs_buffer
-    dice, statuses = random.Random(48), dict.fromkeys(ALLOWED, 0)
-    for _ in range(120):
-        request = request_for()
-        place(request, "car", at(9.0, 0.2, 1.0))
-        for _ in range(dice.randint(1, 4)):
-            spoil(request, dice)
-        data = bytearray(request.SerializeToString())
-        if dice.random() < 0.2:
-            data = data[: dice.randrange(len(data))]
-        try:
-            method = "/nre.grpc.protos.sensorsim.SensorsimService/render_lidar"
-            answer = pb2.LidarRenderReturn.FromString(client.channel.unary_unary(method)(bytes(data), timeout=60))
-            assert np.isfinite(points_of(answer)).all()
-            statuses["OK"] += 1
-        except grpc.RpcError as error:
-            statuses[error.code().name] += 1  # a status that is not allowed is a KeyError
-    assert min(statuses[name] for name in ("OK", "INVALID_ARGUMENT", "NOT_FOUND", "UNIMPLEMENTED")) > 3, statuses
+    dice, statuses = random.Random(48), dict.fromkeys(ALLOWED | {"DEADLINE_EXCEEDED"}, 0)
+    held: list[float] = []
+    for number in range(count):
+        status = status_of(client, hostile(dice), timeout=dice.choice((60, 60, 60, 60, 60, 0.001)))
+        statuses[status] += 1  # a status that is not allowed is a KeyError
+        if number % 100 == 99:
+            assert client.render_lidar(theirs(request_for())).point_xyzs_buffer == expected
+            held.append(used_mb())
+    named = ("OK", "INVALID_ARGUMENT", "NOT_FOUND", "UNIMPLEMENTED", "DEADLINE_EXCEEDED")
+    assert min(statuses[name] for name in named) > count // 50, statuses
     assert "a request failed" not in caplog.text
-    assert client.render_lidar(theirs(request_for())).point_xyzs_buffer == expected
+    # A request that was given up may still be drawn while one looks.
+    assert min(held[-3:]) - min(held[:3]) < MAX_GROWTH, held

@@ -15,14 +15,7 @@ if TYPE_CHECKING:
     from sparsestreet.scene.storage import StoredScene
     from sparsestreet.types import View
 
-Mode = Literal["settings", "blend", "step", "costs", "scaling"]
-
-COSTS_STREET = (
-    "data.log.settings.width=96",
-    "data.log.settings.height=64",
-    "data.log.settings.num_frames=8",
-)
-"""A street of which every effect can be built; what they cost is measured on another."""
+Mode = Literal["settings", "step"]
 
 USAGE = """\
 sparsestreet bench [MODE] [key=value ...]     what the splat op costs in time, memory and accuracy
@@ -30,15 +23,12 @@ sparsestreet bench [MODE] [key=value ...]     what the splat op costs in time, m
   sparsestreet bench                            settings of the op, on five scenes; the street is made of numbers
   sparsestreet bench quick=true                 the same at sizes that take a minute or two: to see that it runs
   sparsestreet bench settings street=RUN        the street of a run that train wrote; its exact images take minutes
-  sparsestreet bench blend                      stages of the C++ backend beside vectorized torch, and the floor
   sparsestreet bench step                       phases of a training step: time, operations, distance to their floors
   sparsestreet bench step sparsify=paper        the same of another training: options as those of train
-  sparsestreet bench costs street=RUN           what each effect adds to a frame of a trained street, beside the plan's
-  sparsestreet bench scaling threads=2          time against pairs, 1,000 to 3,000,000 splats, and a straight line
 
-  mode      settings, blend, step, costs or scaling (default: settings); a word without a key
+  mode      settings or step (default: settings); a word without a key
   quick     true: tiny sizes and few repeats, whose times mean little
-  street    settings, costs: the folder of a trained run
+  street    settings: the folder of a trained run
   threads   threads of the CPU (default: as torch finds them)
   out       folder for records and figures (default: outputs/bench)
 
@@ -59,10 +49,8 @@ class BenchRequest:
     def __post_init__(self) -> None:
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads is at least 1, got {self.threads}")
-        if self.street is not None and self.mode not in ("settings", "costs"):
-            raise ValueError(f"street=RUN is for the modes settings and costs, got {self.mode}: leave it out")
-        if self.street is None and self.mode == "costs":
-            raise ValueError("costs measures a trained street: name the folder of its run with street=RUN")
+        if self.street is not None and self.mode != "settings":
+            raise ValueError(f"street=RUN is for the mode settings, got {self.mode}: leave it out")
 
 
 def bench(arguments: list[str]) -> int:
@@ -86,8 +74,7 @@ def _bench(command: str, overrides: list[str], request: BenchRequest) -> None:
     if request.mode == "step":
         _step(request, overrides, command)
     else:
-        file = record_file(request.out, request.mode, command)
-        {"settings": _settings, "blend": _blend, "costs": _costs, "scaling": _scaling}[request.mode](request, file)
+        _settings(request, record_file(request.out, request.mode, command))
     if not noise_between(before, calibrate(torch.device("cpu"))).quiet:
         print("the machine was not quiet: compare these times with no others")
 
@@ -108,17 +95,6 @@ def _settings(request: BenchRequest, file: "RecordFile") -> None:
         print(f"drawn: {path}")
 
 
-def _blend(request: BenchRequest, file: "RecordFile") -> None:
-    from sparsestreet.bench import blend
-    from sparsestreet.bench.scenes import Size
-    from sparsestreet.bench.timing import ONCE, TimingBudget
-
-    if request.quick:
-        blend.run_blend(Size(64, 48, 300), [Size(48, 32, 200)], ONCE, ONCE, file)
-    else:
-        blend.run_blend(blend.MAIN, blend.TRAINING, TimingBudget(), TimingBudget(repeats=3), file)
-
-
 def _step(request: BenchRequest, overrides: Sequence[str], command: str) -> None:
     from tempfile import TemporaryDirectory
 
@@ -134,32 +110,6 @@ def _step(request: BenchRequest, overrides: Sequence[str], command: str) -> None
     with TemporaryDirectory() as folder:
         train = train_with(overrides, Path(folder))
         step.run_step(" ".join(["train", *overrides]), train, window, file, request.out)
-
-
-def _costs(request: BenchRequest, file: "RecordFile") -> None:
-    from sparsestreet.bench import costs
-    from sparsestreet.bench.scenes import Size
-    from sparsestreet.bench.timing import ONCE, TimingBudget
-    from sparsestreet.cli.commands.effects import known_effects
-
-    assert request.street is not None, "checked by BenchRequest"
-    stored, view = _stored(request.street)
-    street = costs.Street(dict(stored.scene.nodes.items()), view)
-    effects, data = known_effects(COSTS_STREET)
-    if request.quick:
-        costs.run_costs(effects, data, street, (1.0, 0.5), (Size(48, 32, 200),), ONCE, file)
-    else:
-        costs.run_costs(effects, data, street, costs.SCALES, costs.PROXIES, TimingBudget(60, 60.0), file)
-
-
-def _scaling(request: BenchRequest, file: "RecordFile") -> None:
-    from sparsestreet.bench import scaling
-    from sparsestreet.bench.timing import ONCE, TimingBudget
-
-    if request.quick:
-        scaling.run_scaling((200, 400, 800), None, ONCE, file, request.out)
-    else:
-        scaling.run_scaling(scaling.ROWS, scaling.LARGE, TimingBudget(seconds=15.0, least=5), file, request.out)
 
 
 def trained_street(run: Path) -> "BenchScene":

@@ -3,9 +3,8 @@
 import sys
 import textwrap
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
@@ -13,10 +12,6 @@ from sparsestreet.cli.config.compose import as_typed, composed, value_of
 from sparsestreet.cli.config.log_from_options import with_found_data
 from sparsestreet.cli.config.validate import config_problem, override_problem, with_effect_keys
 from sparsestreet.records.run import EffectDecision
-
-if TYPE_CHECKING:
-    from sparsestreet.scene.effects import EffectSettings
-    from sparsestreet.scene.initialize.training_data import TrainingData
 
 USAGE = """\
 sparsestreet effects [data=... data.root=DIR] [effects.NAME=on|off] [out=DIR] [other options of train]
@@ -55,15 +50,6 @@ def effects(arguments: list[str]) -> int:
         print(f"sparsestreet effects: {error}", file=sys.stderr)
         return 1
     return 0
-
-
-def known_effects(overrides: Sequence[str]) -> "tuple[Mapping[str, EffectSettings], TrainingData]":
-    """The effects that a training with these options knows, and what they would be built from."""
-    from sparsestreet.cli.runs.run import opened
-    from sparsestreet.scene.initialize.training_data import TrainingData
-
-    _, data, recipe = opened(composed(overrides))
-    return recipe.effects, TrainingData(data.driving_log, data.split.train, data.split.held_out_indices)
 
 
 def _plan(cfg: DictConfig, out: Path | None) -> Iterator[str]:

@@ -180,7 +180,7 @@ def _for_plain_viewers(
     from dataclasses import replace
 
     from sparsestreet.cli.commands.scenes import recorded_views
-    from sparsestreet.export.plain import plain_factors, spread_cameras
+    from sparsestreet.export.ply import plain_factors, spread_cameras
 
     try:
         cameras = spread_cameras(recorded_views(request.scene, request.views).all)

@@ -13,20 +13,19 @@ from sparsestreet.metrics.definitions import PROTOCOLS, Protocol
 from sparsestreet.report.bundle import write_bundle
 from sparsestreet.report.collect import collect, keep_records
 from sparsestreet.report.figures import time_figure
-from sparsestreet.report.sections import section_tables, sections, sections_markdown, size_figure
+from sparsestreet.report.sections import section_tables, sections, sections_markdown
 from sparsestreet.report.sweep import sweep_records, write_report
 from sparsestreet.report.variants import variants
 
 USAGE = """\
-sparsestreet report DIR [DIR ...] [baseline=NAME] [sections=scenes|mean|all] [protocol=drivestudio|strict]
-                            [markdown=FILE] [figure=FILE.png] [records=FILE.jsonl]
+sparsestreet report DIR [DIR ...] [baseline=NAME] [protocol=drivestudio|strict] [markdown=FILE] [records=FILE.jsonl]
 sparsestreet report sweep=DIR [protocol=drivestudio|strict] [figure=FILE.png]
 sparsestreet report DIR|sweep=DIR bundle=FILE.zip [scenes=true]
 sparsestreet report verify FILE.zip [row=NUMBER]
 
 Tables of all runs below the folders: one per scene, then the mean over scenes. Runs of one label and one configuration
 are repeats and share a column; a label's other configurations have columns named by the options that differ. With a
-baseline (label or name of a column), differences to it, paired by scene and seed. The figure shows PSNR against size.
+baseline (label or name of a column), differences to it, paired by scene and seed.
 records=FILE writes a line of JSON for each run or job: what made it, and what was measured. scripts/check_numbers.py
 compares a page's numbers with such a file.
 
@@ -50,7 +49,6 @@ class ReportRequest:
     folders: tuple[Path, ...] = ()
     sweep: Path | None = None
     baseline: str | None = None
-    sections: Literal["scenes", "mean", "all"] = "all"
     protocol: Literal["drivestudio", "strict"] = "drivestudio"
     markdown: Path | None = None
     figure: Path | None = None
@@ -61,10 +59,10 @@ class ReportRequest:
     def __post_init__(self) -> None:
         if bool(self.folders) == (self.sweep is not None):
             raise ValueError("name folders of runs, or sweep=DIR: one of both")
-        if self.sweep is not None and (self.baseline or self.markdown or self.sections != "all"):
-            raise ValueError(
-                "the report of a sweep has all of its sections: sweep=DIR goes with protocol, figure, records, bundle"
-            )
+        if self.sweep is not None and (self.baseline or self.markdown):
+            raise ValueError("a sweep's report has all tables: sweep=DIR goes with protocol, figure, records, bundle")
+        if self.sweep is None and self.figure is not None:
+            raise ValueError("the figure is of a sweep: say sweep=DIR, or leave figure out")
         if self.scenes and self.bundle is None:
             raise ValueError("scenes go into a bundle: say bundle=FILE.zip")
         if self.bundle is not None and self.bundle.suffix != ".zip":
@@ -90,19 +88,12 @@ def _report(request: ReportRequest) -> None:
     if request.sweep is not None:
         _report_sweep(request.sweep, protocol, request.figure)
         return
-    records = collect(request.folders)
-    found = sections(records, request.baseline, protocol)
-    if request.figure is not None:
-        size_figure(records, request.figure)
-    wanted = request.sections
-    shown = [one for one in found if wanted in ("all", "mean" if one.over_scenes else "scenes")]
-    if not shown:
-        raise ValueError("no configuration was run on two scenes, so there is no mean")
+    found = sections(collect(request.folders), request.baseline, protocol)
     console = Console()
-    for part in section_tables(shown, console.width):
+    for part in section_tables(found, console.width):
         console.print(part)
     if request.markdown is not None:
-        request.markdown.write_text(sections_markdown(shown))
+        request.markdown.write_text(sections_markdown(found))
 
 
 def _report_sweep(folder: Path, protocol: Protocol, picture: Path | None) -> None:

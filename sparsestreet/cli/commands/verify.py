@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from sparsestreet.atomic import atomic_folder
 from sparsestreet.cli.commands.options import OptionError, run_command
-from sparsestreet.cli.config.compose import PATHS, as_typed, composed, quoted, resolved
+from sparsestreet.cli.config.compose import PATHS, as_typed, composed, quoted, resolved, with_images
 from sparsestreet.cli.config.log_from_options import reader_of
 from sparsestreet.cli.config.validate import config_problem, override_problem
 from sparsestreet.cli.runs.folder import CONFIGURATION, TRACKS_FILE, received_words, without_environment
@@ -136,8 +136,6 @@ def _counts(run: RunDescription) -> list[str]:
 
 def _configuration(words: list[str], run: RunDescription, source: Path) -> DictConfig:
     """The configuration of the words. Raises ValueError, naming what differs, where it is not that of the record."""
-    from sparsestreet.cli.runs.run import with_images  # torch, which the check of a bundle needs not
-
     images = run.config.get("training_views.images")
     cfg = with_images(composed(words), images if isinstance(images, int) else None)
     if problem := config_problem(cfg):

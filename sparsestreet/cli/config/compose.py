@@ -244,6 +244,13 @@ def resolved(cfg: DictConfig) -> dict[str, Any]:
     return cast(dict[str, Any], OmegaConf.to_container(cfg, resolve=True))
 
 
+def with_images(cfg: DictConfig, images: int | None) -> DictConfig:
+    """The configuration of a run whose training sees so many images."""
+    known = cfg.copy()
+    known.training_views.images = images
+    return known
+
+
 def load_run_config(run: Path) -> DictConfig:
     """The configuration that a run wrote, with the log where the run had it.
 

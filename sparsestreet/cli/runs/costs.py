@@ -11,6 +11,7 @@ from typing import Any, cast
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from sparsestreet.cli.config.compose import with_images
 from sparsestreet.records.configuration import Configuration, Setting
 from sparsestreet.records.costs import COSTS
 from sparsestreet.records.run import RUN
@@ -76,7 +77,7 @@ def kind_of(cfg: DictConfig) -> Kind:
 
 def _fixed_value(cfg: DictConfig) -> Callable[[str], Any]:
     """Return what reads a value: None where it grows with the log, or cannot be known yet."""
-    known = _with_images(cfg, _MANY)
+    known = with_images(cfg, _MANY)
 
     def value(key: str) -> Any:
         found = _selected(cfg, key)
@@ -92,18 +93,12 @@ def _limits_of(cfg: DictConfig) -> Callable[[int | None], Mapping[str, Setting]]
 
     @cache
     def limits(images: int | None) -> Mapping[str, Setting]:
-        own, free = _with_images(cfg, images), _with_images(uncounted, images)
+        own, free = with_images(cfg, images), with_images(uncounted, images)
         found = {name: _selected(own, f"node.{name}.max_gaussians") for name in cfg.node or ()}
         alike = {name for name, limit in found.items() if limit == _selected(free, f"node.{name}.max_gaussians")}
         return {name: limit if name in alike else OF_ANOTHER_RUN for name, limit in found.items()}
 
     return limits
-
-
-def _with_images(cfg: DictConfig, images: int | None) -> DictConfig:
-    known = cfg.copy()
-    known.training_views.images = images
-    return known
 
 
 def _selected(cfg: DictConfig, key: str) -> Any:

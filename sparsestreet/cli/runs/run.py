@@ -15,7 +15,7 @@ from hydra.utils import instantiate
 from lightning import Callback, Trainer
 from omegaconf import DictConfig
 
-from sparsestreet.cli.config.compose import check_moved, configuration, resolved
+from sparsestreet.cli.config.compose import check_moved, configuration, resolved, with_images
 from sparsestreet.cli.config.log_from_options import reader_of
 from sparsestreet.cli.config.validate import config_problem, preset_notes
 from sparsestreet.cli.process import is_worker_rank, keep_freed_memory
@@ -99,13 +99,6 @@ def opened(cfg: DictConfig) -> tuple[DictConfig, StreetData, Recipe]:
     data = data_of(cfg)
     known = with_images(cfg, len(data.split.train))
     return known, data, recipe_of(known)
-
-
-def with_images(cfg: DictConfig, images: int | None) -> DictConfig:
-    """The configuration of a run whose training sees so many images."""
-    known = cfg.copy()
-    known.training_views.images = images
-    return known
 
 
 def trainer_of(cfg: DictConfig, devices: Any) -> Callable[..., Trainer]:

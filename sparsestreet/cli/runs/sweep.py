@@ -21,7 +21,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from sparsestreet.cli.config.compose import configuration, is_sweep, resolved, value_of, without_flags
+from sparsestreet.cli.config.compose import configuration, is_sweep, resolved, value_of, with_images, without_flags
 from sparsestreet.cli.config.resolvers import UNCOUNTED
 from sparsestreet.cli.config.validate import SHOWS, SWEEPS, flags_of
 from sparsestreet.cli.runs.folder import folder_problem, give_back, holds_same_run, is_whole, same_run
@@ -209,8 +209,6 @@ def run_job(cfg: DictConfig, out: Path, train: Callable[[], float | None]) -> fl
 
 def finished(cfg: DictConfig, out: Path) -> float | None:
     """The PSNR of a folder that holds the complete record of this very job; None where it has to be trained."""
-    from sparsestreet.cli.runs.run import with_images
-
     try:
         summary = SUMMARY.read(out)
     except RecordError:

@@ -75,7 +75,6 @@ class Cost:
     """What an effect is predicted to cost: numbers that are stored, and time of a frame by pixels and rows.
 
     Times are those of one thread of the machine that docs/effects.md names; another machine scales all alike.
-    ``sparsestreet bench costs`` measures them.
     """
 
     numbers: int = 0
