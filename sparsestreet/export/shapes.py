@@ -1,4 +1,4 @@
-"""Shapes of a street for physics: the hull of each object, and hulls and ground as one .obj."""
+"""Shapes of a street for physics: the hull of each object; hulls, ground and surroundings as one .obj."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,12 +17,15 @@ from sparsestreet.scene.edits.ground import GroundMesh, ground_mesh
 from sparsestreet.scene.loaded_scene import check_numbers
 from sparsestreet.scene.nodes import Tracked
 from sparsestreet.scene.storage import StoredScene
+from sparsestreet.scene.surroundings import surroundings, without_ground
 from sparsestreet.types import Gaussians, View
 
 MIN_OPACITY = 0.5
 """Opacity of the Gaussians that a hull is around."""
 GROUND = "ground"
 """Name of the ground in an .obj."""
+SURROUNDINGS = "surroundings"
+"""Name there of what else stands still."""
 
 
 @dataclass(frozen=True)
@@ -71,22 +74,29 @@ class Shapes:
     """Names of the objects."""
     boxes: tuple[str, ...]
     """Names of those that show no more than their box."""
+    surroundings: Mesh | None
+    """None: not asked for, or nothing stands there."""
 
 
 @torch.no_grad()
-def write_shapes(path: Path, stored: StoredScene, views: Sequence[View], time: float) -> Shapes:
+def write_shapes(
+    path: Path, stored: StoredScene, views: Sequence[View], time: float, voxel: float | None = None
+) -> Shapes:
     """Write the ground and the hulls of the objects that are there at a time as one .obj, an object each.
 
-    It has the axes of the street: x ahead, y left, z up; meters.
+    It has the axes of the street: x ahead, y left, z up; meters. With ``voxel`` (meters), it has the surroundings too.
 
-    Raises ValueError for a time beyond [0, 1], a number that is none, a scene without either, two objects whose names
-    are one word, OSError where the file cannot be written.
+    Raises ValueError for a time beyond [0, 1], a number that is none, a scene without any, two shapes whose names are
+    one word, OSError where the file cannot be written, and what not else as ``surroundings``.
     """
     if not 0 <= time <= 1:
         raise ValueError(f"time runs from 0 (first frame of the log) to 1 (its last), got {time}")
     check_numbers(stored.scene)
     ground = ground_mesh(stored.scene, views)
-    meshes = {} if ground is None else {GROUND: ground.mesh}
+    around = None if voxel is None else surroundings(stored.scene, views, stored.options, voxel)
+    around = around if ground is None or around is None else without_ground(around, ground.mesh)
+    found_meshes = {GROUND: None if ground is None else ground.mesh, SURROUNDINGS: around}
+    meshes = {name: mesh for name, mesh in found_meshes.items() if mesh is not None}
     boxes = []
     for node_name, node in stored.scene.nodes.items():
         if not isinstance(node, Tracked):
@@ -104,4 +114,4 @@ def write_shapes(path: Path, stored: StoredScene, views: Sequence[View], time: f
         raise ValueError("nothing tells where the ground is, and no object is there at this time: choose another time")
     with atomic_file(path) as temporary:
         temporary.write_text(obj_text(meshes), encoding="utf-8")
-    return Shapes(ground, tuple(name for name in meshes if name != GROUND), tuple(boxes))
+    return Shapes(ground, tuple(name for name in meshes if name not in found_meshes), tuple(boxes), around)

@@ -5,7 +5,7 @@
    shutter), each with its settings. ``state`` says how far training is.
 2. From a view to an image. ``rendering`` gets the Gaussians from the graph, calls the splat op as its options (in
    ``state``) say, and applies the effects to the image. Effects that change the view come first, in the graph.
-   ``lidar`` draws ranges along rays in the same way.
+   ``lidar`` draws ranges along rays in the same way, and ``surroundings`` makes a mesh of depths.
 3. What a node consists of. It has a table of Gaussians (``gaussians``), whose rows change only by a ``RowPlan``. It has
    a mask (``masks``), density control (``density``) and learning rates (``learning_rate``). ``body`` has the
    formulas of people.

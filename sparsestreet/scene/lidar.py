@@ -125,7 +125,7 @@ def render_ranges(
     for part in _fan(rays):
         moment = 0.0 if duration is None else part.seconds / duration
         placed = scene.gaussians_at(View(part.camera, min(max(time + moment, 0.0), 1.0)))
-        depths, alphas = _at(*_median_depth(placed.gaussians, part.camera, options), part.positions.to(scene.device))
+        depths, alphas = _at(*median_depth(placed.gaussians, part.camera, options), part.positions.to(scene.device))
         ranges[part.rows] = (depths / part.cosines.to(depths)).to(like)
         alpha[part.rows] = alphas.to(like)
         seconds[part.rows] = part.seconds
@@ -195,7 +195,7 @@ def _part(
     return _Part(rows.to(rays.directions.device), camera, image - corner, along[:, 2], seconds)
 
 
-def _median_depth(
+def median_depth(
     gaussians: Gaussians, camera: Camera, options: RenderOptions
 ) -> tuple[Float64[Tensor, "h w"], Float64[Tensor, "h w"]]:
     """Return depth (infinite where more than half of the light passes) and coverage of each pixel."""

@@ -54,6 +54,11 @@ def test_a_street_is_one_file_that_commands_open(run, tmp_path, capsys):
     assert "meshes: a hull of each, no ground.ply, as nothing tells how high the ground is" in said
     assert export([str(small), str(tmp_path / "a.obj"), "time=1"]) == 0
     assert "a.obj: 0 vertices of the ground, 1 object at time 1" in capsys.readouterr().out
+    assert export([str(small), str(tmp_path / "a.obj"), "voxel=0.5"]) == 0
+    assert " triangles of what 3 or more views see within 30 m" in capsys.readouterr().out
+    assert "o surroundings\n" in (tmp_path / "a.obj").read_text()
+    assert export([str(small), str(tmp_path / "a.ply"), "voxel=0.5"]) == 2
+    assert "voxel is no option of a .ply" in capsys.readouterr().err
     assert export([str(small), str(tmp_path / "a.obj"), "nodes=[rigid]"]) == 2
     assert "nodes is no option of a .obj" in capsys.readouterr().err
 

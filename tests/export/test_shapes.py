@@ -9,6 +9,7 @@ import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from sparsestreet.export import shapes as module
 from sparsestreet.export.shapes import Hull, object_hull, write_shapes
 from sparsestreet.geometry.meshes import Mesh
 from sparsestreet.geometry.trajectories import Trajectories
@@ -113,6 +114,28 @@ def test_an_obj_has_what_is_there_where_it_is(tmp_path):
     (mesh,) = read_obj(tmp_path / "c.obj").values()
     own = (mesh.vertices - CENTER) @ TURN.as_matrix()
     np.testing.assert_allclose(own.max(0), [2.0, 0.7, 0.75], atol=2e-4)  # four decimals
+
+
+def test_an_obj_with_surroundings_has_them_beside_ground_and_hulls(tmp_path, monkeypatch):
+    """They are of the views and the voxel that are asked for; without a voxel there are none."""
+    stored, views = stored_street(), street_views()
+    around = Mesh(np.array([[1.0, 0, 0], [2, 0, 0], [1, 1, 3]]), np.array([[0, 1, 2]]))
+    asked = []
+    monkeypatch.setattr(module, "surroundings", lambda *given: asked.append(given) or around)
+    shapes = write_shapes(tmp_path / "a.obj", stored, views, 0.25, voxel=0.3)
+    assert asked == [(stored.scene, views, stored.options, 0.3)]
+    assert shapes.surroundings is around
+    assert shapes.hulls == ("car", "tram")
+    found = read_obj(tmp_path / "a.obj")
+    assert list(found) == ["surroundings", "car", "tram"]
+    np.testing.assert_allclose(found["surroundings"].vertices, around.vertices)
+    write_shapes(tmp_path / "b.obj", stored, views, 0.25)
+    assert len(asked) == 1
+    with torch.no_grad():
+        stored.scene.nodes["background"].rows.means[3, 1] = torch.nan
+    with pytest.raises(ValueError, match=r"means.*nan"):
+        write_shapes(tmp_path / "c.obj", stored, views, 0.25, voxel=0.3)
+    assert not (tmp_path / "c.obj").exists()
 
 
 def test_an_obj_of_nothing_is_an_error(tmp_path):

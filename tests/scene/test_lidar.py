@@ -73,7 +73,7 @@ def test_the_median_is_that_of_the_textbook(backend):
     expected = naive_median_depth(gaussians, view, settings)
     device = device_of(backend)
     drawn = cast(gaussians, torch.float32, device=device)
-    depth, alpha = lidar._median_depth(drawn, view, RenderOptions(settings, backend))
+    depth, alpha = lidar.median_depth(drawn, view, RenderOptions(settings, backend))
     assert 0.1 < np.isinf(expected).mean() < 0.5
     # Float32 sums of up to 22 m, of which the Gaussian's share is at least 1/510: found 5e-5 m.
     np.testing.assert_allclose(depth.cpu().numpy(), expected, rtol=0, atol=1e-3)

@@ -27,6 +27,7 @@ sparsestreet export RUN FILE [key=value ...]     a trained street, as viewers re
   sparsestreet export outputs/RUN street.spz check=true          what the file keeps and loses, measured
   sparsestreet export outputs/RUN objects/                       each object in a file, and poses.json, for engines
   sparsestreet export outputs/RUN street.obj time=0.5            meshes for physics: the ground, hulls of objects
+  sparsestreet export outputs/RUN street.obj voxel=0.2           and what stands around: houses, walls, poles
   sparsestreet export outputs/RUN street.usdz                    what AlpaSim loads of it (docs/serving.md)
 
   scene      a run's folder, a scene.safetensors, or a .street; the first word without a key
@@ -48,6 +49,10 @@ of a .ply or .spz:
              (default: those that suit viewers of plain 3DGS)
   check      true: read the file again, by splat-transform where it is installed, and say what it lost
 
+of an .obj:
+  voxel      meters, 0.05 to 1: the surroundings too, from depths that the drive's cameras see (default: left out);
+             needs scikit-image: pip install 'sparsestreet[mesh]'
+
 of an .html:
   shapes     shapes a second of what changes its shape, such as people (default: 4); more are smoother and larger
 
@@ -66,7 +71,7 @@ _OWN = {
     ".street": (),
     ".ply": (*_FRAME, "antialias"),
     ".spz": (*_FRAME, "sky", "check"),
-    ".obj": ("time",),
+    ".obj": ("time", "voxel"),
     ".html": ("shapes",),
     "": (),
     ".usdz": ("car", "mount", "names"),
@@ -85,6 +90,7 @@ class ExportRequest:
     instance: str | None = None
     edits: Path | None = None
     views: Path | None = None
+    voxel: float | None = None
     shapes: float | None = None
     car: tuple[float, ...] | None = None
     mount: tuple[float, ...] | None = None
@@ -263,15 +269,19 @@ def _export_objects(request: ExportRequest, stored: "StoredScene", views: "Recor
 
 def _export_shapes(request: ExportRequest, stored: "StoredScene", views: "RecordedViews") -> None:
     from sparsestreet.export.shapes import write_shapes
+    from sparsestreet.scene.surroundings import MIN_VIEWS, REACH
 
     time = request.time or 0.0
-    shapes = write_shapes(request.out, stored, views.all, time)
+    shapes = write_shapes(request.out, stored, views.all, time, request.voxel)
     ground, count = 0 if shapes.ground is None else len(shapes.ground.mesh.vertices), len(shapes.hulls)
     objects = f"{count} object{'' if count == 1 else 's'}"
     print(f"{request.out}: {ground:,} vertices of the ground, {objects} at time {time:g}")
     if shapes.ground is not None:
         left_out, filled = f"{shapes.ground.left_out:,}", f"{shapes.ground.filled:,}"
         print(f"left out: {left_out} places near the drive where nothing tells the ground's height; filled: {filled}")
+    if request.voxel is not None:
+        count = 0 if shapes.surroundings is None else len(shapes.surroundings.faces)
+        print(f"surroundings: {count:,} triangles of what {MIN_VIEWS} or more views see within {REACH:g} m")
     if shapes.boxes:
         print(f"boxes, as too few of their Gaussians are opaque: {', '.join(map(one_line, shapes.boxes))}")
 
