@@ -20,6 +20,7 @@ from sparsestreet.data.lidar import depth_image
 from sparsestreet.export.path import CameraPath
 from sparsestreet.export.video import Picture, side_by_side
 from sparsestreet.ops import contribution, splat
+from sparsestreet.ops.spherical_harmonics import of_colors
 from sparsestreet.pictures.images import color_map
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import SceneRendering, node_legend
@@ -113,7 +114,6 @@ _NEAR, _FAR = 1.0, 100.0
 _ENOUGH_IMAGES = 32
 """Images that have seen enough: the lightest color in a picture of ``seen``."""
 _MAX_IMAGES = 255
-_FIRST_HARMONIC = 0.28209479177387814
 
 
 @torch.no_grad()
@@ -289,5 +289,5 @@ def _splatted(
     stored: StoredScene, seen: View, rendering: SceneRendering, share: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "h w 3"]:
     """Return the sum over the Gaussians of their weight at a pixel times their share: colors without harmonics."""
-    labeled = replace(rendering.gaussians, sh=((share - 0.5) / _FIRST_HARMONIC)[:, None])
+    labeled = replace(rendering.gaussians, sh=of_colors(share))
     return splat(labeled, seen.camera, settings=stored.options.settings, backend=stored.options.backend).rgb

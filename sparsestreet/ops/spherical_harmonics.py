@@ -7,6 +7,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 
+def of_colors(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
+    """Return the harmonics of degree 0 that show these colors from everywhere.
+
+    >>> of_colors(torch.full((1, 3), 0.5))
+    tensor([[[0., 0., 0.]]])
+    """
+    return ((colors - 0.5) * (2 * math.sqrt(math.pi)))[:, None]
+
+
 def basis(directions: Float[Tensor, "n 3"], terms: int) -> Float[Tensor, "n k"]:
     """The first ``terms`` (1, 4, 9 or 16) basis functions at unit directions.
 

@@ -11,6 +11,7 @@ from sparsestreet.data.lazy import as_frames
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.ops import leave_one_out
 from sparsestreet.pruning.importance import Importance
+from sparsestreet.pruning.ranges import depth_costs
 from sparsestreet.pruning.seen import Gathered, regions, squared_errors
 from sparsestreet.pruning.select import (
     Keep,
@@ -104,6 +105,9 @@ class LeaveOneOutRule(PruningRule):
     costs (see ``select.Keep``)."""
     beside: float | None = None
     """Meters; None: only recorded views count. Scoring takes twice the time."""
+    depth: float = 0.1
+    """Weight of the change of depth where lidar says that it is right, relative to its present error
+    (``ranges.depth_changes``). It decides with the cost which rows go first; the budget is of images alone."""
 
     def __post_init__(self) -> None:
         if self.beside is not None and not self.beside > 0:
@@ -112,6 +116,8 @@ class LeaveOneOutRule(PruningRule):
             check_keep(self.keep)
         if not self.allowed_db >= 0:
             raise ValueError(f"allowed_db must be >= 0 dB of training PSNR, got {self.allowed_db}")
+        if not self.depth >= 0:
+            raise ValueError(f"depth is a weight >= 0 of the change of depth, got {self.depth}: 0 asks images alone")
         if not self.noticeable >= 0:
             raise ValueError(f"noticeable must be >= 0 (images lie in [0, 1]), got {self.noticeable}")
 
@@ -125,9 +131,14 @@ class LeaveOneOutRule(PruningRule):
         seen = context.gathered or Gathered(scene, self.areas(scene))
         costs = self.costs(scene, seen.rest(as_frames(frames), context.ranks), context, seen)
         floors = seen.areas.floors(context.ranks)
+        costs = {name: costs[name] for name in floors}
+        order = costs
+        if self.depth > 0:
+            of_depth = depth_costs(scene, frames, context)
+            order = {name: cost + self.depth * of_depth[name] for name, cost in costs.items()}
         if self.keep is not None:
-            return keep_counts(costs, self.keep, floors, context)
-        return keep_by_cost({name: costs[name] for name in floors}, 10 ** (self.allowed_db / 10) - 1, floors)
+            return keep_counts(order, self.keep, floors, context)
+        return keep_by_cost(costs, 10 ** (self.allowed_db / 10) - 1, floors, order)
 
     @torch.no_grad()
     def costs(

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64, Int
 from torch import Tensor
 
 from sparsestreet.data.frame_cache import to_device
@@ -111,13 +111,16 @@ def keep_by_importance(scores: Float[Tensor, " n"], floors: Floors) -> Selection
 
 
 def keep_by_cost(
-    costs: Mapping[str, Float[Tensor, " _"]], allowed: float, floors: Mapping[str, Floors]
+    costs: Mapping[str, Float[Tensor, " _"]],
+    allowed: float,
+    floors: Mapping[str, Floors],
+    order: Mapping[str, Float[Tensor, " _"]] | None = None,
 ) -> dict[str, Selection]:
-    """Drops the cheapest rows of all nodes together while their costs add up to ``allowed`` at most.
+    """Drops the rows of all nodes together, lowest ``order`` first, while their costs add up to ``allowed`` at most.
 
-    ``costs`` and ``floors`` are by name of the node. At a floor the most expensive rows stay and, among equals, the
-    lower row; their cost is not spent on others. Raises ValueError for costs that are NaN or negative, or a negative
-    floor.
+    ``costs``, ``floors`` and ``order`` (None: the costs) are by name of the node. At a floor the rows that would go
+    last stay and, among equals, the lower row; their cost is not spent on others. Raises ValueError for costs or an
+    order that are NaN or negative, or a negative floor.
 
     >>> costs = {"road": torch.tensor([0.1, 0.5]), "cars": torch.tensor([0.2])}
     >>> kept = keep_by_cost(costs, allowed=0.4, floors={"road": Floors(0), "cars": Floors(0)})
@@ -126,10 +129,12 @@ def keep_by_cost(
     """
     if not costs:
         return {}
-    everything = torch.cat([cost.double() for cost in costs.values()])
-    if not (everything >= 0).all():
-        raise ValueError(f"costs of removal must be numbers >= 0, got {float(everything[~(everything >= 0)][0])}")
-    return keep_by_rank(costs, int((everything.sort().values.cumsum(0) <= allowed).sum()), floors)
+    order = costs if order is None else order
+    every, places = (torch.cat([each.double() for each in one.values()]) for one in (costs, order))
+    for one in (every, places):
+        if not (one >= 0).all():
+            raise ValueError(f"costs of removal must be numbers >= 0, got {float(one[~(one >= 0)][0])}")
+    return keep_by_rank(order, int((every[_lowest_first(places)].cumsum(0) <= allowed).sum()), floors)
 
 
 def keep_by_rank(
@@ -142,18 +147,21 @@ def keep_by_rank(
     >>> keep_by_rank({"road": torch.tensor([0.1, 0.5])}, number=1, floors={"road": Floors(0)})["road"].keep.tolist()
     [False, True]
     """
-    everything = torch.cat([score.double() for score in scores.values()]) if scores else torch.zeros(0)
+    everything = torch.cat([score.double() for score in scores.values()]) if scores else torch.zeros(0).double()
     if not 0 <= number <= len(everything):
         raise ValueError(
             f"{number:,} rows are to go, and the nodes that the rule may take from have {len(everything):,}: take "
             "fewer, or let it take from more nodes"
         )
-    # Among equals the later row goes first, as at the floors.
-    lowest_first = len(everything) - 1 - torch.sort(everything.flip(0), stable=True).indices
     unwanted = torch.zeros(len(everything), dtype=torch.bool, device=everything.device)
-    unwanted[lowest_first[:number]] = True
+    unwanted[_lowest_first(everything)[:number]] = True
     parts = unwanted.split([len(score) for score in scores.values()])
     return {name: keep_best(scores[name], part, *floors[name]) for name, part in zip(scores, parts, strict=True)}
+
+
+def _lowest_first(scores: Float64[Tensor, " n"]) -> Int[Tensor, " n"]:
+    """Return the rows in the order in which they go. Among equals the later one goes first, as at the floors."""
+    return len(scores) - 1 - torch.sort(scores.flip(0), stable=True).indices
 
 
 Keep = int | float | Mapping[str, int | float]

@@ -66,6 +66,14 @@ def test_rank_rule_drops_a_number_of_the_lowest_of_all_nodes(first, second, shar
     assert chosen["b"].keep.tolist() == by_hand(second, unwanted[len(first) :], 0)
 
 
+def test_an_order_of_its_own_spends_the_same_budget():
+    """By hand: 0.3 of row 2 goes first, then 0.2 makes it 0.5; a floor keeps what would go last."""
+    costs, order = {"a": torch.tensor([0.1, 0.2, 0.3])}, {"a": torch.tensor([3.0, 2.0, 1.0])}
+    assert keep_by_cost(costs, 0.4, {"a": Floors(0)}, order)["a"].keep.tolist() == [True, True, False]
+    assert keep_by_cost(costs, 0.51, {"a": Floors(0)}, order)["a"].keep.tolist() == [True, False, False]
+    assert keep_by_cost(costs, 9.0, {"a": Floors(1)}, order)["a"].keep.tolist() == [True, False, False]
+
+
 def test_without_nodes_nothing_is_chosen():
     assert keep_by_cost({}, 1.0, {}) == {}
     assert keep_by_rank({}, 0, {}) == {}

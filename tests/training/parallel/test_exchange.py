@@ -1,5 +1,6 @@
 """What processes tell each other: sums in order, gradients of rows that any saw, scenes that must be the same."""
 
+from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import torch.distributed as dist
 from torch import Tensor, nn
 
 from sparsestreet.pruning import LeaveOneOutRule, RenderContext
+from sparsestreet.pruning.ranges import depth_costs
 from sparsestreet.ranks import ALONE, LostProcessError, Ranks
 from sparsestreet.scene.density import DensityStatistics
 from sparsestreet.scene.graph import SceneGraph
@@ -59,11 +61,15 @@ def scores(ranks: Ranks) -> dict[str, Tensor]:
     street = SceneGraph({"road": background(12), "cars": rigid(8, min_instance_gaussians=600.0)})
     set_rows(street.nodes["cars"], "opacity_logits", {1: 9.0})
     frames = [frame_at(index, 16 + 8 * index, 16) for index in range(5)]
+    # From a meter to 30 across each image, so that some are right; the last view is without lidar.
+    depths = [torch.linspace(1.0, 30.0, 16 + 8 * index).expand(16, -1) for index in range(4)]
+    frames = [replace(frame, depth=depth) for frame, depth in zip(frames, [*depths, None], strict=True)]
     context = RenderContext(options=RenderOptions(), ranks=ranks)
     rule = LeaveOneOutRule(allowed_db=0.1)
     floors = rule.floors(street, frames, context)["cars"].instances
     assert floors is not None
-    return rule.costs(street, frames, context) | {"floors": floors.least}
+    costs = rule.costs(street, frames, context) | {"floors": floors.least}
+    return costs | {f"depth of {name}": cost for name, cost in depth_costs(street, frames, context).items()}
 
 
 def statistics_of(rank: int) -> DensityStatistics:
@@ -167,7 +173,8 @@ def test_pruning_scores_views_together(answers):
     assert alone["floors"].tolist() == [3, 4]  # by the widest image, which the second process looks at
     for answer in answers:
         assert torch.equal(answer["scores"]["floors"], alone["floors"])
-        for node in ("road", "cars"):
+        assert (alone["depth of road"] > 0).sum() > 1
+        for node in ("road", "cars", "depth of road", "depth of cars"):
             torch.testing.assert_close(answer["scores"][node], alone[node], rtol=1e-6, atol=0)
 
 
