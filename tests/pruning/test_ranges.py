@@ -11,6 +11,7 @@ from sparsestreet.pruning.ranges import depth_changes, depth_costs
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import Frame
 from tests.pruning.test_rules import CONTEXT, frame_of, scene_of
+from tests.typed import there
 
 OPACITIES, DEPTHS = [0.6, 0.5, 0.9], [4.0, 4.2, 4.5]
 PIXELS = 63
@@ -52,9 +53,8 @@ def test_changes_of_depth_are_those_of_the_view_without_each_row():
         rows.log_scales.fill_(6.0)  # flat to 1e-4 across the image, also where their centers are far outside of it
         rows.means[:, 0] = torch.tensor([1.0, -2.0, 3.0])
     scene, frame = turned(scene, replace(frame_of(scene, 20), depth=depth))
-    assert frame.depth is not None
     with torch.no_grad():
-        error, changes = depth_changes(scene, frame, frame.depth, CONTEXT)
+        error, changes = depth_changes(scene, frame, there(frame.depth), CONTEXT)
     right = [1.05, 0.97, 1.0]
     assert float(error) == pytest.approx(sum((one - 1) ** 2 for one in right), rel=1e-3)  # of float32's 1e-7 of 0.03
     for row, change in enumerate(changes.tolist()):
@@ -76,7 +76,7 @@ def test_costs_are_of_all_views_together():
     scene = scene_of(OPACITIES, DEPTHS)
     frames = [replace(frame_of(scene, 20), depth=torch.full((7, 9), depth)) for depth in (4.0, 4.15)]
     with torch.no_grad():
-        (first, changed), (second, also) = (depth_changes(scene, one, one.depth, CONTEXT) for one in frames)
+        (first, changed), (second, also) = (depth_changes(scene, one, there(one.depth), CONTEXT) for one in frames)
     expected = (changed + also) / (first + second)
     assert first > 2 * second > 0
     torch.testing.assert_close(depth_costs(scene, frames, CONTEXT)["background"], expected, rtol=1e-12, atol=0.0)
