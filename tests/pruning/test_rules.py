@@ -299,7 +299,13 @@ def test_a_number_of_the_whole_scene_goes_whatever_nodes_it_may_take_from(remove
 
 @pytest.mark.parametrize(
     ("settings", "said"),
-    [((-0.1,), ">= 0 dB"), ((float("nan"),), ">= 0 dB"), ((0.1, -1.0), "must be >= 0"), ((0.1, 0.0, None, 0.0), "0 m")],
+    [
+        ((-0.1,), ">= 0 dB"),
+        ((float("nan"),), ">= 0 dB"),
+        ((0.1, -1.0), "must be >= 0"),
+        ((0.1, 0.0, None, 0.0), "0 m"),
+        ((0.1, 0.0, None, None, -1.0), "depth is a weight >= 0"),
+    ],
 )
 def test_bad_settings_are_refused(settings, said):
     with pytest.raises(ValueError, match=said):
