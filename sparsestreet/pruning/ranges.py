@@ -40,7 +40,9 @@ def depth_costs(scene: SceneGraph, frames: Sequence[Frame], context: RenderConte
     changes = error.new_zeros(sum(scene.counts().values()))
     for frame in on_device(scene, frames, context.ranks):
         if frame.depth is not None:
-            of_view, change = depth_changes(scene, frame, frame.depth, context)
+            # The lidar looks over the hood, which training does not show to the scene.
+            depth = frame.depth if frame.ego is None else frame.depth.masked_fill(frame.ego, 0.0)
+            of_view, change = depth_changes(scene, frame, depth, context)
             error, changes = error + of_view, changes + change
     costs = context.ranks.sum(changes) / context.ranks.sum(error).clamp(min=MIN_ERROR)
     return dict(zip(scene.nodes, costs.split(list(scene.counts().values())), strict=True))

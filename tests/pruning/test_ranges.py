@@ -130,6 +130,20 @@ def test_the_budget_is_of_images_alone():
         assert rule.select(scene, [frame], CONTEXT)["background"].keep.tolist() == kept
 
 
+def test_a_return_behind_the_recording_car_tells_nothing():
+    """The hood is no part of the scene, and the lidar looks over it."""
+    scene = scene_of(OPACITIES, DEPTHS)
+    hood = torch.zeros(7, 9, dtype=torch.bool)
+    hood[5:] = True
+    # Below the hood other errors than above it: as many returns alike would cancel in the share.
+    depth = torch.where(hood, 4.1, 4.2)
+    shown = replace(frame_of(scene, 20), depth=depth)
+    hidden, left_out = replace(shown, ego=hood), replace(shown, depth=depth.masked_fill(hood, 0.0))
+    every, behind, above = (depth_costs(scene, [one], CONTEXT)["background"] for one in (shown, hidden, left_out))
+    assert torch.equal(behind, above)
+    assert not torch.equal(behind, every)
+
+
 def test_a_log_without_lidar_is_asked_for_images_alone():
     scene = scene_of(OPACITIES, DEPTHS)
     assert depth_costs(scene, [frame_of(scene, 20)], CONTEXT)["background"].tolist() == [0.0, 0.0, 0.0]
