@@ -16,7 +16,7 @@ from torch import Tensor
 from sparsestreet.export.ply import scene_gaussians
 from sparsestreet.export.recording import Cloud, Part
 from sparsestreet.geometry import quaternions as quat
-from sparsestreet.ops.spherical_harmonics import basis
+from sparsestreet.ops.spherical_harmonics import basis, of_colors
 from sparsestreet.scene.effects import Sky
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.storage import StoredScene
@@ -69,8 +69,6 @@ UNSEEN = 1 / 255
 """Opacity below which no viewer draws anything."""
 _NEAREST, _FARTHEST = 500.0, 2000.0
 """Meters of the dome; within 2,048 a .spz keeps a fourth of a millimeter."""
-_FIRST = 0.5 / np.sqrt(np.pi)
-"""The first harmonic."""
 
 
 @torch.no_grad()
@@ -133,7 +131,7 @@ def _discs(cloud: Cloud, terms: int) -> Gaussians:
     variances, axes = torch.linalg.eigh(torch.from_numpy(cloud.covariances).double())
     axes = torch.where(torch.linalg.det(axes)[:, None, None] < 0, -axes, axes)
     colors = torch.zeros(len(cloud), terms, 3)
-    colors[:, 0] = (torch.from_numpy(cloud.colors) - 0.5) / _FIRST
+    colors[:, :1] = of_colors(torch.from_numpy(cloud.colors))
     return Gaussians(
         torch.from_numpy(cloud.centers),
         quat.from_matrix(axes).float(),

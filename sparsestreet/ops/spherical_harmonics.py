@@ -6,6 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+FIRST = 0.5 / math.sqrt(math.pi)
+"""Value of the harmonic of degree 0."""
+
 
 def of_colors(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
     """Return the harmonics of degree 0 that show these colors from everywhere.
@@ -13,7 +16,7 @@ def of_colors(colors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
     >>> of_colors(torch.full((1, 3), 0.5))
     tensor([[[0., 0., 0.]]])
     """
-    return ((colors - 0.5) * (2 * math.sqrt(math.pi)))[:, None]
+    return ((colors - 0.5) / FIRST)[:, None]
 
 
 def basis(directions: Float[Tensor, "n 3"], terms: int) -> Float[Tensor, "n k"]:
@@ -23,7 +26,7 @@ def basis(directions: Float[Tensor, "n 3"], terms: int) -> Float[Tensor, "n k"]:
     """
     x, y, z = directions.unbind(-1)
     pi = math.pi
-    values = [torch.full_like(x, 0.5 / math.sqrt(pi))]
+    values = [torch.full_like(x, FIRST)]
     if terms > 1:
         first = math.sqrt(3 / (4 * pi))
         values += [-first * y, first * z, -first * x]

@@ -22,7 +22,7 @@ RIGHT = 0.1
 returns that went through a window or past an edge would outweigh all others."""
 
 MIN_ERROR = 1e-12
-"""Squared error, relative to the depth, that stands for no error."""
+"""Squared error (images lie in [0, 1], depths are relative) that stands for no error; its inverse fits into float32."""
 
 
 def depth_costs(scene: SceneGraph, frames: Sequence[Frame], context: RenderContext) -> dict[str, Float64[Tensor, " _"]]:

@@ -11,7 +11,7 @@ from sparsestreet.data.lazy import as_frames
 from sparsestreet.geometry.cameras import moved
 from sparsestreet.ops import leave_one_out
 from sparsestreet.pruning.importance import Importance
-from sparsestreet.pruning.ranges import depth_costs
+from sparsestreet.pruning.ranges import MIN_ERROR, depth_costs
 from sparsestreet.pruning.seen import Gathered, regions, squared_errors
 from sparsestreet.pruning.select import (
     Keep,
@@ -30,9 +30,6 @@ from sparsestreet.scene.gaussians import Selection
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import render
 from sparsestreet.types import Frame, LeaveOneOut, View
-
-MIN_ERROR = 1e-12
-"""Squared error (images lie in [0, 1]) that stands for no error; its inverse fits into float32."""
 
 
 @dataclass(frozen=True)

@@ -197,7 +197,7 @@ def status_of(client: Any, data: bytes, timeout: float) -> str:
     "count", [pytest.param(120, marks=pytest.mark.lengthy), pytest.param(1000, marks=pytest.mark.slow)]
 )
 def test_hostile_requests_leave_the_server_as_it_was(client, caplog, count):
-    """Some are given up at once. Every hundredth is a good one: its answer stays, byte for byte, and so does memory."""
+    """Some are given up at once. After each hundred a good one has its answer, byte for byte; of many, memory stays."""
     expected = client.render_lidar(theirs(request_for())).point_xyzs_buffer
     dice, statuses = random.Random(48), dict.fromkeys(ALLOWED | {"DEADLINE_EXCEEDED"}, 0)
     held: list[float] = []
@@ -210,5 +210,6 @@ def test_hostile_requests_leave_the_server_as_it_was(client, caplog, count):
     named = ("OK", "INVALID_ARGUMENT", "NOT_FOUND", "UNIMPLEMENTED", "DEADLINE_EXCEEDED")
     assert min(statuses[name] for name in named) > count // 50, statuses
     assert "a request failed" not in caplog.text
-    # A request that was given up may still be drawn while one looks.
-    assert min(held[-3:]) - min(held[:3]) < MAX_GROWTH, held
+    assert client.render_lidar(theirs(request_for())).point_xyzs_buffer == expected
+    if count >= 600:  # a request that was given up may still be drawn while one looks: least of three against three
+        assert min(held[-3:]) - min(held[:3]) < MAX_GROWTH, held

@@ -13,6 +13,7 @@ from torch import Tensor
 from sparsestreet.geometry.boxes import box_at, inside_box
 from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.geometry.quaternions import normalized
+from sparsestreet.ops.spherical_harmonics import of_colors
 from sparsestreet.scene.gaussians import Rows
 from sparsestreet.types import Sweep, Track
 
@@ -205,9 +206,6 @@ def _cubes(points: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
     return (places[:, 0] << 42) | (places[:, 1] << 21) | places[:, 2]
 
 
-SH_CONSTANT = 0.5 / math.sqrt(math.pi)
-"""Value of the spherical harmonic of degree 0."""
-
 MINIMUM_SCALE = 1e-3
 """Meters; coincident points have distance 0, but a scale needs a logarithm."""
 
@@ -271,7 +269,7 @@ def init_gaussians(
         "log_scales": scales.float().log()[:, None].expand(-1, 3),
         "quaternions": normalized(torch.randn(num_rows, 4, generator=generator)),
         "opacity_logits": torch.logit(opacities.float()),
-        "sh_dc": ((colors.float().clamp(min=DARKEST) - 0.5) / SH_CONSTANT)[:, None, :],
+        "sh_dc": of_colors(colors.float().clamp(min=DARKEST)),
         "sh_rest": torch.zeros(num_rows, (sh_degree + 1) ** 2 - 1, 3),
     }
     masks = dict(mask_columns or {})

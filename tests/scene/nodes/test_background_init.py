@@ -6,7 +6,7 @@ import torch
 
 from sparsestreet.data.lazy import Sweeps, as_frames
 from sparsestreet.geometry.cameras import inverse, transform_points
-from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
+from sparsestreet.ops.spherical_harmonics import FIRST
 from sparsestreet.scene.initialize.sources import LidarPoints, NearPoints
 from sparsestreet.scene.nodes import Background, BackgroundSettings, RigidSettings
 from sparsestreet.triangulation import StreetPoints
@@ -36,7 +36,7 @@ def build(
 
 
 def colors(node: Background) -> torch.Tensor:
-    return 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
+    return 0.5 + FIRST * node.rows.sh_dc[:, 0]
 
 
 def test_lidar_outside_moving_boxes_keeps_its_color():

@@ -4,7 +4,7 @@ from typing import cast
 import torch
 
 from sparsestreet.data.lazy import Sweeps
-from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
+from sparsestreet.ops.spherical_harmonics import FIRST
 from sparsestreet.scene.nodes import Rigid, RigidSettings
 from sparsestreet.triangulation import StreetPoints
 from tests.scene.street import (
@@ -46,7 +46,7 @@ def test_only_what_moves_and_is_of_the_classes():
 def test_points_lie_in_the_box_in_the_cars_color():
     node = build(CARS)
     assert (node.rows.means.abs() <= node.sizes[0] / 2 + 1e-4).all()
-    colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
+    colors = 0.5 + FIRST * node.rows.sh_dc[:, 0]
     torch.testing.assert_close(colors, torch.tensor(CAR_COLOR).expand_as(colors))
 
 
@@ -65,7 +65,7 @@ def test_few_points_are_filled_up_on_the_box():
     added = node.rows.means[2 * NUM_FRAMES :]
     on_a_face = ((added.abs() - node.sizes[0] / 2).abs() < 1e-5).any(1)
     assert on_a_face.all()
-    colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
+    colors = 0.5 + FIRST * node.rows.sh_dc[:, 0]
     torch.testing.assert_close(colors, torch.tensor(CAR_COLOR).expand_as(colors))  # the mean of equal colors
 
 
@@ -102,7 +102,7 @@ def test_points_from_images_in_the_box_join_those_of_the_lidar():
         node = CARS.build(training_data(log, movers=CARS, points=points), torch.Generator().manual_seed(0))
         assert instance_counts(as_a(Rigid, node)) == [total]
         assert node.rows.means[:2].tolist() == inside
-        colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0]
+        colors = 0.5 + FIRST * node.rows.sh_dc[:, 0]
         torch.testing.assert_close(colors[:2], torch.tensor([[0.2, 0.4, 0.6]] * 2))
     torch.testing.assert_close(colors, torch.tensor([0.2, 0.4, 0.6]).expand(50, 3))  # the box too
 

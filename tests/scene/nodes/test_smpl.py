@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from sparsestreet.geometry import quaternions as quat
 from sparsestreet.geometry.skeleton import JOINTS
+from sparsestreet.ops.spherical_harmonics import FIRST
 from sparsestreet.scene.body import BuiltinBody, surface
 from sparsestreet.scene.gaussians import RowPlan
-from sparsestreet.scene.initialize.gaussians import SH_CONSTANT
 from sparsestreet.scene.masks import TemporalMaskSettings
 from sparsestreet.scene.masks.temporal import TemporalMask
 from sparsestreet.scene.nodes import Smpl
@@ -66,7 +66,7 @@ def test_one_flat_gaussian_lies_on_each_vertex():
     torch.testing.assert_close(torch.pi * scales[:, 0] * scales[:, 1], areas, atol=1e-8, rtol=1e-4)
     torch.testing.assert_close(scales[:, 2], scales[:, 0] / 2)
     torch.testing.assert_close(torch.sigmoid(rows.opacity_logits), torch.full((2 * VERTICES,), 0.99))
-    colors = 0.5 + SH_CONSTANT * rows.sh_dc[:, 0]
+    colors = 0.5 + FIRST * rows.sh_dc[:, 0]
     torch.testing.assert_close(colors, torch.tensor(SHIRT).expand(2 * VERTICES, 3))
     assert rows.sh_rest.shape == (2 * VERTICES, 3, 3)
 
@@ -87,7 +87,7 @@ def test_a_person_in_random_colors():
     """Uniform in [0, 1]: of 3 colors a vertex, of two people, each its own."""
     two = data_of(walker(), walker("tall", height=1.9, y=3.0))
     node = smpl_settings(random_colors=True).build(two, torch.Generator().manual_seed(0))
-    colors = 0.5 + SH_CONSTANT * node.rows.sh_dc[:, 0].detach()
+    colors = 0.5 + FIRST * node.rows.sh_dc[:, 0].detach()
     assert len(colors.unique()) > 0.99 * colors.numel()
     assert (colors.min() >= -1e-6, colors.max() <= 1 + 1e-6) == (True, True)
     # The standard error of the mean of n uniform numbers is 1 / sqrt(12 n).
@@ -101,7 +101,7 @@ def test_points_of_images_color_what_is_near_them(returns, elsewhere):
     above = triangulated([[0.0, 0.0, 0.9]] * 4, color=HAIR)
     points = StreetPoints(triangulated([]), {"walker": above})
     data = replace(data_of(walker(), returns=returns), image_points=points)
-    colors = 0.5 + SH_CONSTANT * smpl_settings().build(data, torch.Generator()).rows.sh_dc[:, 0]
+    colors = 0.5 + FIRST * smpl_settings().build(data, torch.Generator()).rows.sh_dc[:, 0]
     for vertex, color in (
         (TEMPLATE.vertices[:, 1].argmax(), HAIR),
         (TEMPLATE.vertices.norm(dim=1).argmin(), elsewhere),
