@@ -133,7 +133,7 @@ FEWEST = 20
 WEIGHTS = np.array([-0.5, 1.0, -0.5]) / np.sqrt(1.5)
 """Of an image and those before and behind it: what is constant or grows evenly falls out."""
 POINTS = ImagePointSettings(
-    features=600, epipolar_tolerance=4.0, max_error=4.0, min_support=0.3, max_depth_error=0.1, threads=1
+    features=600, epipolar_tolerance=4.0, max_error=4.0, min_support=0.3, max_depth_error=0.1, sweep=None, threads=1
 )
 """Wide enough for poses that are a few pixels off."""
 

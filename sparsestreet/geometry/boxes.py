@@ -79,6 +79,38 @@ def inside_box(
     return (points_in_box.abs() <= 0.5 * enlargement * size).all(1)
 
 
+def crossings(
+    start: Float[Tensor, "*#n 3"], steps: Float[Tensor, "n 3"], size: Float[Tensor, "3"]
+) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Return s where the lines start + s steps enter a box around the origin, and where they leave it.
+
+    By the slabs of Kay and Kajiya (1986). A line that misses the box leaves before it enters.
+
+    >>> start, steps = torch.zeros(1, 3), torch.tensor([[0.0, 0.0, 2.0], [3.0, 0.0, 0.0]])
+    >>> crossings(start - 3, steps + 3, torch.tensor([4.0, 2.0, 2.0]))
+    (tensor([0.6667, 0.6667]), tensor([0.8000, 0.8333]))
+    """
+    steps = torch.where(steps.abs() < 1e-6, 1e-6, steps)
+    sides = ((-0.5 * size - start) / steps, (0.5 * size - start) / steps)
+    return torch.minimum(*sides).amax(1), torch.maximum(*sides).amin(1)
+
+
+def through_box(
+    camera_from_box: Float64[Tensor, "4 4"], rays: Float64[Tensor, "n 3"], size: Float[Tensor, "3"]
+) -> Bool[Tensor, " n"]:
+    """Return whether rays from a camera, in its frame, meet a box ahead of it.
+
+    >>> camera_from_box = torch.eye(4, dtype=torch.float64)
+    >>> camera_from_box[2, 3] = 5.0
+    >>> rays = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    >>> through_box(camera_from_box, rays, torch.tensor([2.0, 2.0, 2.0])).tolist()
+    [True, False, False]
+    """
+    box_from_camera = inverse(camera_from_box)
+    enters, leaves = crossings(box_from_camera[:3, 3], rays @ box_from_camera[:3, :3].T, size.double())
+    return (enters <= leaves) & (leaves > 0)
+
+
 def without_frames(tracks: Sequence[Track], frames: frozenset[int]) -> tuple[Track, ...]:
     """Return the tracks without their boxes of some frames, such as held-out ones; a track of no other is left out.
 

@@ -15,7 +15,7 @@ from sparsestreet.scene.generators import named_generator
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes.node import Node, NodeSettings
-from sparsestreet.triangulation import ImagePointSettings, kept_street_points
+from sparsestreet.triangulation import ImagePointSettings, StreetPoints, kept_street_points
 from sparsestreet.types import Track
 
 
@@ -54,6 +54,21 @@ def assign_tracks(tracks: Sequence[Track], nodes: Mapping[str, NodeSettings]) ->
 _log = logging.getLogger(__name__)
 
 
+def find_points(
+    log: DrivingLog,
+    train_frames: Frames,
+    held_out: frozenset[int],
+    nodes: Mapping[str, NodeSettings],
+    settings: ImagePointSettings | None,
+) -> StreetPoints | None:
+    """Return points from the training images, those of an earlier run if it kept them; None without settings."""
+    if settings is None:
+        return None
+    moving = without_frames(assign_tracks(log.tracks, nodes).claimed, held_out)
+    with stage("points"):
+        return kept_street_points(log.kept, train_frames, moving, settings)
+
+
 def build_scene(
     log: DrivingLog,
     train_frames: Frames,
@@ -61,7 +76,7 @@ def build_scene(
     nodes: Mapping[str, NodeSettings],
     plan: EffectPlan,
     seed: int,
-    image_points: ImagePointSettings | None = None,
+    points: StreetPoints | None = None,
 ) -> SceneGraph:
     """Start every node class from what training may see.
 
@@ -73,15 +88,13 @@ def build_scene(
             program's log says so.
         plan: which effects the scene is seen through. The program's log says why.
         seed: each node and effect draws from its own stream, so a change of one leaves the others as they are.
-        image_points: how points are triangulated from the views; None: no node gets any.
+        points: of the views (``find_points``); None: no node gets any.
 
     Raises ValueError where two nodes claim one track, or a node has nothing to start from.
     """
     assignment = assign_tracks(log.tracks, nodes)
     _report(assignment)
     moving = without_frames(assignment.claimed, held_out)
-    with stage("points"):
-        points = None if image_points is None else kept_street_points(log.kept, train_frames, moving, image_points)
     built: dict[str, Node] = {}
     for name, settings in nodes.items():
         data = TrainingData(log, train_frames, held_out, assignment.by_node[name], moving, points)

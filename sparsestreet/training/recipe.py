@@ -1,6 +1,6 @@
 """The parts of a training before any data is read, and the system that comes of them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from lightning import Callback
@@ -10,19 +10,21 @@ from sparsestreet.data.log import DrivingLog
 from sparsestreet.evidence.light import measured_light
 from sparsestreet.records.configuration import Setting, config_hash
 from sparsestreet.records.run import EffectDecision, RunDescription, this_machine, this_source
-from sparsestreet.scene.build import build_scene
+from sparsestreet.scene.build import build_scene, find_points
 from sparsestreet.scene.effects import EffectPlan, EffectSettings, plan_effects
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.nodes import NodeSettings
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions
 from sparsestreet.training.callbacks import DensityControl, MaskTraining, Pruning
+from sparsestreet.training.far_depth import FarDepthTerm
 from sparsestreet.training.losses import Loss, MaskSparsity, Photometric
 from sparsestreet.training.moved_views import MovedViews, moved_view_term
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.probe import Probe
 from sparsestreet.training.schedule import ResolutionSchedule
 from sparsestreet.training.system import StreetSystem
-from sparsestreet.triangulation import ImagePointSettings
+from sparsestreet.triangulation import ImagePointSettings, StreetPoints
+from sparsestreet.types import View
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,8 @@ class Recipe:
     def build(self, data: StreetData, plan: EffectPlan) -> StreetSystem:
         """Start the scene from the training part of the data, and wrap it for training."""
         log, split = data.driving_log, data.split
-        scene = build_scene(log, split.train, split.held_out_indices, self.nodes, plan, self.seed, self.image_points)
+        points = find_points(log, split.train, split.held_out_indices, self.nodes, self.image_points)
+        scene = build_scene(log, split.train, split.held_out_indices, self.nodes, plan, self.seed, points)
         return StreetSystem(
             scene,
             self.losses,
@@ -140,10 +143,17 @@ class Recipe:
             sh_every=self.sh_every,
             sh_every_from=self.sh_every_from,
             resolution=self.resolution,
+            far_depth=self._far_depth(points, split.train.views),
             moved_views=None
             if self.moved_views is None
             else moved_view_term(self.moved_views, data, scene, self.nodes, self.seed),
         )
+
+    def _far_depth(self, points: StreetPoints | None, views: Sequence[View]) -> FarDepthTerm | None:
+        sweep = None if self.image_points is None else self.image_points.sweep
+        if sweep is None or points is None or points.far is None:
+            return None
+        return FarDepthTerm(points.far, views, sweep)
 
 
 def _training_data(data: StreetData) -> TrainingData:

@@ -16,6 +16,7 @@ from sparsestreet.phases import phase
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.rendering import DEFAULT_OPTIONS, RenderOptions, SceneRendering, render
 from sparsestreet.scene.state import SceneState
+from sparsestreet.training.far_depth import FarDepthTerm
 from sparsestreet.training.lightning import (
     ends_step,
     image_number,
@@ -52,6 +53,7 @@ class StreetSystem(LightningModule):
         sh_every_from: float = 0.36,
         resolution: ResolutionSchedule | None = None,
         moved_views: MovedViewTerm | None = None,
+        far_depth: FarDepthTerm | None = None,
     ) -> None:
         """Make a system of its parts.
 
@@ -67,6 +69,7 @@ class StreetSystem(LightningModule):
             sh_every_from: fraction of the run before which every step moves them.
             resolution: size of the images that steps train on; None: whole.
             moved_views: the terms of views beside the path; None: there are none.
+            far_depth: the term of depths that images say; None: there is none.
 
         Raises:
             ValueError: if the interval is not positive, or harmonics would never move.
@@ -88,6 +91,7 @@ class StreetSystem(LightningModule):
         self.sh_every, self.sh_every_from = sh_every, sh_every_from
         self.resolution = resolution or ResolutionSchedule()
         self.moved_views = moved_views
+        self.far_depth = far_depth
         self.rendering: SceneRendering | None = None
         self.screen_gradients = False
         """Density control says for each step whether it needs them."""
@@ -146,6 +150,9 @@ class StreetSystem(LightningModule):
                     terms[name] = loss(seen, recorded, self.scene)
             with phase("regularizers"):
                 terms |= self.scene.regularizers(frame, self.rendering.parts, self.rendering.drawn, state)
+            if self.far_depth is not None and self.far_depth.applies(frame):
+                with phase("far depth"):
+                    terms["far_depth"] = self.far_depth(self.rendering, frame)
             if self.moved_views is not None and self.moved_views.applies(state.step, state.progress):
                 with phase("moved view"):
                     terms |= self.moved_views(self.scene, self.rendering, frame)

@@ -2,52 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float32, Float64, Int, Shaped
 
 from sparsestreet.data.images import WHITE
 from sparsestreet.triangulation.matches import NEAREST, Features, guided_matches, image_pairs, in_image
+from sparsestreet.triangulation.settings import ImagePointSettings
 from sparsestreet.types import View
-
-
-@dataclass(frozen=True, kw_only=True)
-class ImagePointSettings:
-    """How points are found in images. Pixels are those of the training images."""
-
-    features: int = 2000
-    """Most features of one image."""
-    epipolar_tolerance: float = 0.8
-    """Largest distance of a match from the epipolar line, pixels."""
-    ratio: float = 0.8
-    """Largest ratio of the distances to the best match and to the second-best elsewhere on the line (Lowe)."""
-    max_error: float = 0.6
-    """Largest reprojection error, pixels; a view with a larger one does not count."""
-    min_views: int = 3
-    """Least number of views of a point."""
-    min_support: float = 0.6
-    """Of the compared views whose image contains a point, the least share that must show it.
-
-    Windows of a house repeat, but only the right match is seen from all views."""
-    max_depth_error: float = 0.03
-    """Largest standard deviation of a point's position divided by its distance, from parallax and feature noise."""
-    threads: int | None = None
-    """That work at once; None: as many as this process has for its tensors (torch's), by default one a core."""
-
-    def __post_init__(self) -> None:
-        for name in ("features", "threads"):
-            if getattr(self, name) is not None and getattr(self, name) < 1:
-                raise ValueError(f"points from images need {name} of at least 1, got {getattr(self, name)}")
-        if self.min_views < 2:
-            raise ValueError(f"a point must be seen in at least 2 views to be triangulated, got {self.min_views}")
-
-    @property
-    def workers(self) -> int:
-        """How many threads work."""
-        return self.threads or torch.get_num_threads()
-
 
 GAUSS_NEWTON_STEPS = 4
 DAMPING = 1e-9
@@ -205,6 +168,16 @@ class TriangulatedPoints:
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    @staticmethod
+    def concatenate(parts: "Sequence[TriangulatedPoints]") -> "TriangulatedPoints":
+        """Return the points of all parts in order."""
+        starts = np.cumsum([0, *map(len, parts)])[: len(parts)]
+        joined = {
+            entry.name: np.concatenate([getattr(part, entry.name) for part in parts]) for entry in fields(parts[0])
+        }
+        observed = [part.observed + start for part, start in zip(parts, starts, strict=True)]
+        return TriangulatedPoints(**(joined | {"observed": np.concatenate(observed)}))
 
 
 def triangulate(

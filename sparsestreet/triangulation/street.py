@@ -12,17 +12,16 @@ import torch
 from jaxtyping import Bool, Float64
 
 from sparsestreet.data.lazy import Frames
-from sparsestreet.geometry.boxes import box_at
+from sparsestreet.geometry.boxes import box_at, through_box
 from sparsestreet.geometry.lenses import undistort
 from sparsestreet.kept import Kept
 from sparsestreet.triangulation.matches import Features, find_features
-from sparsestreet.triangulation.points import ImagePointSettings, Sighting, TriangulatedPoints, triangulate
+from sparsestreet.triangulation.points import Sighting, TriangulatedPoints, triangulate
+from sparsestreet.triangulation.settings import ENLARGEMENT, ImagePointSettings
+from sparsestreet.triangulation.sweep import swept_points, thinned
 from sparsestreet.types import Camera, Frame, Track, View
 
 log = logging.getLogger(__name__)
-
-ENLARGEMENT = 1.1
-"""Factor of a box's size, for points just outside an imprecise box."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +29,11 @@ class StreetPoints:
     """Points triangulated from the training images; ``views`` count the training views."""
 
     static: TriangulatedPoints
-    """Static points, in the world."""
+    """Static points, in the world; of those far ahead one in each cube."""
     in_boxes: Mapping[str, TriangulatedPoints]
     """Name of a track -> points inside its box, in the box's frame."""
+    far: TriangulatedPoints | None = None
+    """Static points far ahead, in the world, one for each pixel of a swept view; None: no view was swept."""
 
 
 def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointSettings) -> StreetPoints:
@@ -51,15 +52,19 @@ def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointS
         for place, sighting in enumerate(sightings):
             moved = _from_box(sighting, track)
             if moved is not None:
-                through = _through_box(moved, track)
+                through = _through(moved, track)
                 still[place] &= ~through
                 own[place] = moved.where(through)
         in_boxes[track.name] = _inside(triangulate(list(own.values()), settings), list(own), track)
     static = [sighting.where(mask) for sighting, mask in zip(sightings, still, strict=True)]
-    points = StreetPoints(triangulate(static, settings, _report), in_boxes)
+    found = triangulate(static, settings, _report)
     carried = sum(map(len, in_boxes.values()))
-    log.info("points from %d images: %d that stand still, %d in boxes", len(frames), len(points.static), carried)
-    return points
+    log.info("points from %d images: %d that stand still, %d in boxes", len(frames), len(found), carried)
+    if settings.sweep is None:
+        return StreetPoints(found, in_boxes)
+    far = swept_points(frames, moving, settings.sweep, settings.workers)
+    starts = TriangulatedPoints.concatenate((found, thinned(far, settings.sweep.spacing)))
+    return StreetPoints(starts, in_boxes, far)
 
 
 def _report(done: int, total: int) -> None:
@@ -117,16 +122,11 @@ def _from_box(sighting: Sighting, track: Track) -> Sighting | None:
     return replace(sighting, camera_from_frame=sighting.camera_from_frame @ world_from_box.numpy())
 
 
-def _through_box(sighting: Sighting, track: Track) -> Bool[np.ndarray, " n"]:
-    """Whether each feature's ray meets the box ahead of the camera (slab test); the sighting is in the box's frame."""
-    rotation, translation = sighting.camera_from_frame[:3, :3], sighting.camera_from_frame[:3, 3]
-    center = -rotation.T @ translation
-    rays = np.concatenate((sighting.rays, np.ones((len(sighting.rays), 1))), 1) @ rotation
-    half = ENLARGEMENT / 2 * track.size.double().numpy()
-    with np.errstate(divide="ignore", invalid="ignore"):
-        to_planes = np.stack(((-half - center) / rays, (half - center) / rays))
-    enter, leave = to_planes.min(0).max(1), to_planes.max(0).min(1)
-    return (enter <= leave) & (leave > 0)
+def _through(sighting: Sighting, track: Track) -> Bool[np.ndarray, " n"]:
+    """Whether each feature's ray meets the box ahead of the camera; the sighting is in the box's frame."""
+    rays = np.concatenate((sighting.rays, np.ones((len(sighting.rays), 1))), 1)
+    pose = torch.from_numpy(sighting.camera_from_frame)
+    return through_box(pose, torch.from_numpy(rays), ENLARGEMENT * track.size).numpy()
 
 
 def _inside(points: TriangulatedPoints, views: list[int], track: Track) -> TriangulatedPoints:

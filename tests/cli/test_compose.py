@@ -39,7 +39,7 @@ from tests.typed import there
         ),
         (["data/lidr=hdl64"], "did you mean 'data/lidar'"),
         (["data=drivestudio", "data/lidar=hdl64"], "no key 'data/lidar' with these choices: leave it out"),
-        (["image_points=null"], "choose one of none, sift"),
+        (["image_points=null"], "choose one of none, sift, swept"),
         (["methd=3dgs"], "did you mean 'method'? Its options are 3dgs, deformgs, omnire, pvg, streetgs"),
         (["experiment=row/3dgs"], "no option 'row/3dgs' in conf/experiment: choose one of one_schedule"),
         (["experiment=rule"], "experiment/rule holds several options: choose one of importance, lightgaussian"),

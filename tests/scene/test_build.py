@@ -2,7 +2,7 @@ import logging
 
 import torch
 
-from sparsestreet.scene.build import build_scene
+from sparsestreet.scene.build import build_scene, find_points
 from sparsestreet.scene.effects import EffectPlan, SkySettings, plan_effects
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.triangulation import ImagePointSettings, StreetPoints
@@ -78,8 +78,9 @@ def test_points_from_images_are_made_once_of_what_training_sees(monkeypatch):
     frames = log.frames.where(lambda view: view.frame_index != 3)
     nodes = {"background": background_settings(images=7), "cars": CARS}
     settings = ImagePointSettings()
-    scene = build_scene(log, frames, frozenset({3}), nodes, EffectPlan(()), 0, settings)
+    points = find_points(log, frames, frozenset({3}), nodes, settings)
+    scene = build_scene(log, frames, frozenset({3}), nodes, EffectPlan(()), 0, points)
     assert asked == [([0, 1, 2, 4], ["driving"], settings)]
     assert scene.counts() == {"background": 7, "cars": 5000}
-    build_scene(log, frames, frozenset({3}), {"cars": CARS}, EffectPlan(()), 0)
+    assert find_points(log, frames, frozenset({3}), nodes, None) is None
     assert len(asked) == 1

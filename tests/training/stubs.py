@@ -23,6 +23,7 @@ from sparsestreet.scene.masks import Mask, SampledMaskSettings, StaticMaskSettin
 from sparsestreet.scene.nodes import Background, Node, Rigid
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training.callbacks.density_control import RowListener
+from sparsestreet.training.far_depth import FarDepthTerm
 from sparsestreet.training.losses import Loss, Photometric
 from sparsestreet.training.moved_views import MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings
@@ -129,6 +130,7 @@ def make_system(
     sh_every: int = 1,
     sh_every_from: float = 0.0,
     moved_views: MovedViewTerm | None = None,
+    far_depth: FarDepthTerm | None = None,
 ) -> StreetSystem:
     return StreetSystem(
         SceneGraph(nodes, effects),
@@ -140,6 +142,7 @@ def make_system(
         sh_every=sh_every,
         sh_every_from=sh_every_from,
         moved_views=moved_views,
+        far_depth=far_depth,
     )
 
 

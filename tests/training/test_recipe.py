@@ -19,7 +19,8 @@ from sparsestreet.training.losses import MaskSparsity, Photometric
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.recipe import Recipe
 from sparsestreet.training.schedule import Interval
-from sparsestreet.triangulation import ImagePointSettings
+from sparsestreet.triangulation import ImagePointSettings, StreetPoints, SweepSettings
+from tests.scene.street import triangulated
 from tests.training.stubs import background, street_data
 
 PLAIN = BackgroundSettings(mask=None, masked=False, density=None, prunable=False)
@@ -30,9 +31,12 @@ ALWAYS = Interval(0.0, 1.0)
 
 def test_every_part_reaches_the_scene_or_the_system(monkeypatch):
     given: list[tuple[Any, ...]] = []
+    asked: list[tuple[Any, ...]] = []
     scene = SceneGraph({"background": background(3)})
     monkeypatch.setattr(recipe_module, "build_scene", lambda *args: given.append(args) or scene)
     data = street_data(7, stride=3, offset=1)
+    found = StreetPoints(triangulated([]), {}, triangulated([[0.0, 0.0, 30.0]], [(0, 0, 1.5, 2.5)]))
+    monkeypatch.setattr(recipe_module, "find_points", lambda *args: asked.append(args) or found)
     parts = Recipe(
         nodes={"background": PLAIN},
         effects={"sky": SkySettings(resolution=2)},
@@ -41,14 +45,17 @@ def test_every_part_reaches_the_scene_or_the_system(monkeypatch):
         options=RenderOptions(SplatSettings(near_plane=0.3), "reference"),
         sh_interval=0.17,
         seed=5,
-        image_points=ImagePointSettings(),
+        image_points=ImagePointSettings(sweep=SweepSettings(depth_weight=0.7)),
     )
     system = parts.build(data, parts.plan(data))
     ((*places, nodes, plan, seed, points),) = given
     assert places == [data.driving_log, data.split.train, frozenset({1, 4})]
-    assert (nodes, plan, seed, points) == (parts.nodes, parts.plan(data), 5, parts.image_points)
+    assert (nodes, plan, seed, points) == (parts.nodes, parts.plan(data), 5, found)
+    assert asked == [(*places, parts.nodes, parts.image_points)]
     assert system.scene is scene
     assert system.losses == parts.losses
+    assert system.far_depth.weight == 0.7
+    assert [system.far_depth.applies(frame) for frame in data.split.train] == [True, *[False] * 4]
     assert (system.optimizer_settings, system.options) == (parts.optimizer, parts.options)
     assert (system.radius, system.sh_interval) == (data.driving_log.radius, 0.17)
 

@@ -48,17 +48,19 @@ from sparsestreet.scene.nodes import Node
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.training import losses
 from sparsestreet.training.callbacks import DensityControl
+from sparsestreet.training.far_depth import FarDepthTerm
 from sparsestreet.training.losses import MaskSparsity, Photometric
 from sparsestreet.training.moved_views import MovedViews, MovedViewTerm
 from sparsestreet.training.optimizer import OptimizerSettings
 from sparsestreet.training.schedule import Interval
 from sparsestreet.training.system import StreetSystem
+from sparsestreet.triangulation import SweepSettings
 from sparsestreet.types import Frame, Shutter
 from tests.scene.nodes.test_deformable import objects
 from tests.scene.nodes.test_field import street as field
 from tests.scene.nodes.test_vibrating import vibrating
 from tests.scene.people import smpl, walker
-from tests.scene.street import POSE_RATES, RATES
+from tests.scene.street import POSE_RATES, RATES, triangulated
 from tests.training.moved_views.test_term import street, wall
 from tests.training.stubs import StubTrainer, background, fit, frame_at, make_system, rigid
 from tests.training.waiting import META, SPLAT, Waits, pretended, waits
@@ -125,7 +127,14 @@ CASES: Mapping[str, tuple[Callable[[], StreetSystem], list[str]]] = {
         lambda: make_system(nodes(), moved_views=MovedViewTerm(MovedViews(every=1), street(wall(4.0)), seed=7)),
         [SPLAT, SPLAT],
     ),
+    "far depth": (lambda: make_system(nodes(), far_depth=far_depth()), [SPLAT]),
 }
+
+
+def far_depth() -> FarDepthTerm:
+    """Of two points that the view of frame 1 sees."""
+    seen = [(0, 0, 1.5, 2.5), (1, 0, 3.0, 0.5)]
+    return FarDepthTerm(triangulated([[0.0, 0.0, 30.0]] * 2, seen), [frame_at(1)], SweepSettings())
 
 
 def frame_with(**changes: Any) -> Frame:

@@ -20,7 +20,7 @@ from sparsestreet.triangulation.points import (
     reprojection_errors,
     triangulate,
 )
-from sparsestreet.triangulation.street import _from_box, _inside, _through_box
+from sparsestreet.triangulation.street import _from_box, _inside, _through
 from sparsestreet.types import Track
 from tests.triangulation.worlds import FOCAL, cloud, descriptors, imaged, pose, rail, sight, view
 from tests.typed import there
@@ -354,7 +354,7 @@ def test_what_is_behind_the_camera_is_not_seen_through():
         at = pose(z=place)
         features = Features(np.zeros((2, 2)), descriptors(np.random.default_rng(0), 2))
         sighting = Sighting(view(at, 0), at, features, rays, np.zeros((2, 3), np.float32))
-        assert _through_box(sighting, BOX).tolist() == seen
+        assert _through(sighting, BOX).tolist() == seen
 
 
 def test_points_of_a_box_name_the_views_that_were_given():

@@ -45,8 +45,8 @@ def street_truth(
 
     def truth(view: View) -> Frame | None:
         middle = first + view.time * (last - first)
-        camera_at = partial(_camera_at, view.camera, street_from_world)
-        camera, instant = camera_at(0.0), instant_at(middle)
+        moved_at = partial(camera_at, view.camera, street_from_world)
+        camera, instant = moved_at(0.0), instant_at(middle)
         if instant.inside_an_actor(camera):
             return None
         shutter = view.camera.shutter
@@ -54,7 +54,7 @@ def street_truth(
             sight = instant.seen_by(camera, settings.supersampling)
         else:
             reading = replace(settings, readout=shutter.seconds, readout_direction=shutter.direction)
-            sight = captured(reading, lambda seconds: instant_at(middle + seconds), camera_at)
+            sight = captured(reading, lambda seconds: instant_at(middle + seconds), moved_at)
         image = developed(camera, sight)
         near = instant.actors_within(settings.annotation_range, camera)
 
@@ -73,7 +73,7 @@ def street_truth(
     return truth
 
 
-def _camera_at(camera: Camera, street_from_world: Float64[Tensor, "4 4"], seconds: float) -> StreetCamera:
+def camera_at(camera: Camera, street_from_world: Float64[Tensor, "4 4"], seconds: float) -> StreetCamera:
     """Return the camera where its shutter moves it to within ``seconds`` from the middle of the readout."""
     world_from_camera = (street_from_world @ inverse(camera.camera_from_world.double())).numpy()
     if camera.shutter is not None and seconds:

@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 from sparsestreet.data.images import WHITE
 from sparsestreet.data.lazy import Frames, Sweeps
 from sparsestreet.data.lidar import visible_pixels
-from sparsestreet.geometry.boxes import CarriedPoints, box_at, inside_box
+from sparsestreet.geometry.boxes import CarriedPoints, box_at, crossings, inside_box
 from sparsestreet.geometry.cameras import inverse, project, transform_points
 from sparsestreet.kept import Kept
 from sparsestreet.scene.generators import named_generator
@@ -213,7 +213,7 @@ def unhidden(
 
 
 def behind_boxes(camera: Camera, points: Float[Tensor, "n 3"], boxes: Sequence[Box]) -> Bool[Tensor, " n"]:
-    """Whether the line from the camera to a point meets one of the boxes, by the slabs of Kay and Kajiya (1986).
+    """Whether the line from the camera to a point meets one of the boxes.
 
     >>> camera = Camera(torch.eye(4), torch.eye(3), width=4, height=4)
     >>> box = torch.eye(4, dtype=torch.float64)
@@ -227,10 +227,7 @@ def behind_boxes(camera: Camera, points: Float[Tensor, "n 3"], boxes: Sequence[B
         box_from_world = inverse(world_from_box).to(points)
         eye = transform_points(box_from_world, camera.position[None].to(points))
         steps = transform_points(box_from_world, points) - eye
-        steps = torch.where(steps.abs() < 1e-6, 1e-6, steps)
-        half = 0.5 * ENLARGEMENT * size.to(points)
-        sides = ((-half - eye) / steps, (half - eye) / steps)
-        enters, leaves = torch.minimum(*sides).amax(1), torch.maximum(*sides).amin(1)
+        enters, leaves = crossings(eye, steps, ENLARGEMENT * size.to(points))
         hidden |= (enters < leaves) & (leaves > 0) & (enters < 1)
     return hidden
 
