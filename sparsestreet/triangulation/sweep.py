@@ -39,13 +39,12 @@ FRONTAL = 5.0, 32
 """The least depth of planes across the view, meters, and how many at equal steps of its inverse up to the farthest."""
 WINDOW = 5
 """Pixels: side of the square that is compared."""
-MIN_CONTRAST = 0.015
-"""Least standard deviation of gray in a window, of 1: evenly painted things look alike at any depth."""
 RIVAL = 1.12, 0.05
 """A depth that differs by more than this factor must score less by so much: patterns repeat along a wall."""
 AGREEMENT = 0.05, 2, 3
 """Relative difference of depths that agree, how many neighbors must, of how many swept before and as many after."""
 _EPSILON = 1e-7
+"""Added to the product of two variances of gray, so that evenly painted things look like nothing."""
 
 
 @dataclass(frozen=True)
@@ -210,12 +209,11 @@ def _depth(image: _Image, others: Sequence[_Image], settings: SweepSettings) -> 
             alike = _correlation(image.gray, mean, contrast, warp.seen_at(depth, other.gray))
             best, second = np.maximum(best, alike), np.maximum(second, np.minimum(best, alike))
         score[:] = (best + second) / 2
-    scores[(planes < FRONTAL[0]) | (planes > 2 * settings.farthest)] = -1
     first = scores.argmax(0)
     depth = np.take_along_axis(planes, first[None], 0)[0]
     score = np.take_along_axis(scores, first[None], 0)[0]
     rival = np.where(np.abs(np.log(planes / depth)) > np.log(RIVAL[0]), scores, -1).max(0)
-    counts = image.solid & (contrast > MIN_CONTRAST**2) & (score > settings.min_score) & (score - rival > RIVAL[1])
+    counts = image.solid & (score > settings.min_score) & (score - rival > RIVAL[1])
     counts &= (depth > settings.nearest) & (depth < settings.farthest)
     return np.where(counts, depth, 0).astype(np.float32)
 

@@ -12,7 +12,7 @@ from sparsestreet.geometry.lenses import distort, undistort
 from sparsestreet.kept import Kept
 from sparsestreet.triangulation import ImagePointSettings, SweepSettings, TriangulatedPoints, kept_street_points
 from sparsestreet.triangulation.sweep import partners, swept_points, thinned
-from sparsestreet.types import Camera, Frame, Track
+from sparsestreet.types import Camera, Frame, Track, View
 
 SETTINGS = SweepSettings()
 pytestmark = pytest.mark.lengthy
@@ -264,13 +264,27 @@ def test_a_car_that_stands_sees_nothing(drive):
     assert found.views.dtype.kind == "i"
 
 
+def views(poses: list[np.ndarray], camera_index: int = 0) -> list[View]:
+    cameras = [Camera(torch.from_numpy(np.linalg.inv(pose)).float(), torch.eye(3), 8, 6) for pose in poses]
+    return [View(camera, place / 20, place, camera_index) for place, camera in enumerate(cameras)]
+
+
 def test_views_are_compared_across_the_asked_distances():
-    views = [photograph(pose_at(x), place)[0] for place, x in enumerate((0.0, 2.0, 4.0, 7.0, 13.0, 17.0, 50.0, 57.0))]
-    plan = partners(views, step=2.5)
+    plan = partners(views([pose_at(x) for x in (0.0, 2.0, 4.0, 7.0, 13.0, 17.0, 50.0, 57.0)]), step=2.5)
     assert plan[0] == (3, 4)  # 6, 12 m; the one beyond 18 m is farther than MAX_BASELINE
     assert plan[2] == (4, 5)  # 9 m is the first from 6 m on, 13 m from 12 m on
     assert 1 not in plan  # 2 m after the one before
     assert 7 not in plan  # one view alone
+
+
+def test_views_are_compared_along_their_way_alone():
+    """A camera to the side, one that looks back, and one that turns about halfway."""
+    places = [2.0 * place for place in range(24)]
+    assert partners(views([pose_at(x, yaw=70) for x in places]), step=2.5) == {}
+    assert partners(views([pose_at(x, yaw=180) for x in places]), step=2.5)[6] == (9, 12, 15, 3, 0)
+    turning = partners(views([pose_at(x, yaw=0 if x < 24 else 60) for x in places]), step=2.5)
+    assert sorted(turning) == [0, 2, 4, 6, 8, 10]
+    assert max(other for others in turning.values() for other in others) == 11
 
 
 def test_smaller_images_are_faster_and_as_right(points, small, drive):
