@@ -134,6 +134,9 @@ def test_points_lie_on_the_walls(points, drive):
     assert np.median(found) < 0.015
     assert np.mean(found < 0.05) > 0.95
     assert np.quantile(from_walls(points.positions), 0.9) < 3
+    depths = FOCAL * points.pixel_sizes
+    assert 20 < depths.min() < 21
+    assert depths.max() < 180
 
 
 def test_most_of_what_is_far_is_found(points, drive):
@@ -144,6 +147,13 @@ def test_most_of_what_is_far_is_found(points, drive):
 
 def test_only_the_camera_that_looks_along_the_way_is_swept(points, drive):
     assert {drive[place][0].camera_index for place in points.views} == {0}
+
+
+def test_a_camera_does_not_agree_with_another_that_shows_the_same(small, drive):
+    """A second camera at the same place with the same images would agree in every pixel, right or wrong."""
+    both = [one for frame, _ in drive[::2] for one in (frame, replace(frame, camera_index=2))]
+    found = swept_points(as_frames(both), [], SMALL)
+    assert len(found) == 2 * len(small)
 
 
 def test_each_point_is_observed_at_the_pixel_that_shows_it(points, drive):
