@@ -72,7 +72,7 @@ def swept_points(
         frames: training views.
         moving: objects that move on their own; nothing is found through their boxes.
         settings: limits of the search.
-        threads: that work at once.
+        threads: that work at once; each needs about 2.6 kB a pixel of the compared images.
     """
     plan = partners(frames.views, settings.step)
     needed = sorted({place for first, others in plan.items() for place in (first, *others)})
@@ -121,7 +121,10 @@ _NOTHING = TriangulatedPoints(
 
 
 def partners(views: Sequence[View], step: float) -> dict[int, tuple[int, ...]]:
-    """Return the places of the views to sweep, and of each the views of the same camera that it is compared with."""
+    """Return the places of the views to sweep, and of each the views of the same camera that it is compared with.
+
+    ``step``: meters from one swept view to the next, at least.
+    """
     centers = np.array([view.camera.position.double().numpy() for view in views]).reshape(-1, 3)
     axes = np.array([view.camera.camera_from_world[2, :3].double().numpy() for view in views]).reshape(-1, 3)
     found: dict[int, tuple[int, ...]] = {}

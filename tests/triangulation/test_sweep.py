@@ -297,7 +297,7 @@ def test_views_are_compared_along_their_way_alone():
     assert max(other for others in turning.values() for other in others) == 11
 
 
-def test_smaller_images_are_faster_and_as_right(points, small, drive):
+def test_smaller_images_have_fewer_points_that_are_as_right(points, small, drive):
     assert 0.15 * len(points) < len(small) < 0.5 * len(points)
     assert np.median(errors(small, drive)) < 0.02
     # a point stands for a pixel as recorded, not for the larger one that was compared
