@@ -405,6 +405,18 @@ class Contribution:
 
 
 @dataclass(frozen=True)
+class MedianDepth:
+    """The splat behind which at most half of the light passes, in each pixel of one view."""
+
+    depth: Float[Tensor, "h w"]
+    """Of that splat's mean along the optical axis, meters; infinite where more than half passes all splats."""
+    rows: Int[Tensor, "h w"]
+    """Which row it is; -1 where there is none."""
+    alpha: Float[Tensor, "h w"]
+    """Coverage up to that splat and with it, or of all splats."""
+
+
+@dataclass(frozen=True)
 class LeaveOneOut:
     """How much one view changes when each row alone is removed and the others stay."""
 

@@ -16,7 +16,7 @@ from sparsestreet.ops.guards import Guards, guards
 from sparsestreet.ops.raster import LeaveOneOutSums, PairLimitError
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.sky import over_sky
-from sparsestreet.ops.splat import contribution, leave_one_out, splat
+from sparsestreet.ops.splat import contribution, leave_one_out, median_depth, splat
 
 __all__ = [
     "Guards",
@@ -26,6 +26,7 @@ __all__ = [
     "contribution",
     "guards",
     "leave_one_out",
+    "median_depth",
     "over_sky",
     "resolve_backend",
     "splat",

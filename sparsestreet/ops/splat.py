@@ -1,5 +1,6 @@
 """The public signatures of the op: it takes Gaussians and a camera, and returns a differentiable Rendering."""
 
+from dataclasses import replace
 from functools import cache
 from types import ModuleType
 
@@ -13,7 +14,7 @@ from sparsestreet.ops.cpu import rasterizer as cpu
 from sparsestreet.ops.raster import MIN_ALPHA, LeaveOneOutSums, Raster
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_changes, check_gates, check_pixel_weights, check_structure
-from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
+from sparsestreet.types import Camera, Contribution, Gaussians, Harmonics, LeaveOneOut, MedianDepth, Rendering
 
 DEFAULT_SETTINGS = SplatSettings()
 
@@ -115,6 +116,39 @@ def contribution(
     chosen = resolve_backend(backend, gaussians.means.device)
     with torch.no_grad(), torch.autocast(gaussians.means.device.type, enabled=False):
         return _module(chosen).contribution(gaussians, camera, settings)
+
+
+@disable_compile
+def median_depth(
+    gaussians: Gaussians,
+    camera: Camera,
+    *,
+    settings: SplatSettings = DEFAULT_SETTINGS,
+    backend: str = "auto",
+) -> MedianDepth:
+    """Find the splat behind which at most half of the light passes, in each pixel. No gradients.
+
+    A rendering's mean depth lies between the surfaces that a pixel mixes; this one is of a single splat (2DGS, Huang et
+    al. 2024, median depth). Where pixels stop otherwise (``settings``) plays no part.
+
+    Raises as :func:`splat` does.
+
+    >>> means = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 4.0]])
+    >>> scales, opacities = torch.full((2, 3), 0.4), torch.tensor([0.4, 0.9])
+    >>> pair = Gaussians(means, torch.ones(2, 4), scales, opacities, torch.zeros(2, 1, 3))
+    >>> camera = Camera(torch.eye(4), torch.tensor([[20.0, 0, 4.5], [0, 20, 4.5], [0, 0, 1]]), width=9, height=9)
+    >>> found = median_depth(pair, camera)
+    >>> found.depth[4, 4], found.rows[4, 4]  # 0.6 of the light passes the first, 0.06 both
+    (tensor(4.), tensor(1))
+    """
+    check_structure(gaussians, camera, None)
+    chosen = resolve_backend(backend, gaussians.means.device)
+    sh = gaussians.sh
+    # Colors are not asked for, so one term of them is read.
+    plain = replace(gaussians, sh=replace(sh, terms=1) if isinstance(sh, Harmonics) else sh[:, :1])
+    halfway = replace(settings, transmittance_min=0.5, stop="inclusive")
+    with torch.no_grad(), torch.autocast(gaussians.means.device.type, enabled=False):
+        return _module(chosen).median_depth(plain, camera, halfway)
 
 
 @disable_compile

@@ -1,13 +1,12 @@
 """Ranges along the rays of a lidar, drawn by the splat op as it is: a fan of pinhole views around the sensor.
 
-The op returns a mean depth, which lies between the surfaces that a pixel mixes. A return comes from one surface, so a
-range here is the median: the depth of the Gaussian behind which less than half of the light passes. Two renders give it
-exactly. Both stop at half of the light, one with that Gaussian and one before it, and their difference is its share.
+A rendering has a mean depth, which lies between the surfaces that a pixel mixes. A return comes from one surface, so a
+range here is the median: the depth of the Gaussian behind which at most half of the light passes (``median_depth``).
 """
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int
@@ -15,12 +14,10 @@ from torch import Tensor
 
 from sparsestreet.finite import check_finite, check_rows
 from sparsestreet.geometry.cameras import inverse
-from sparsestreet.ops import splat
-from sparsestreet.ops.raster import MIN_ALPHA
-from sparsestreet.ops.settings import StopRule
+from sparsestreet.ops import median_depth
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.state import DEFAULT_OPTIONS, RenderOptions
-from sparsestreet.types import Camera, Gaussians, Harmonics, View
+from sparsestreet.types import Camera, MedianDepth, View
 
 VIEWS = 8
 """Level views of 360 / 8 degrees. Twelve see nothing better."""
@@ -39,11 +36,6 @@ EDGE = 1.2
 """Ratio of the depths of neighboring pixels from which on they show different surfaces."""
 MARGIN = 1.5
 """Pixels around the rays of a view: the four around each of them are in the image."""
-MIN_SPLAT_ALPHA = 1 / 255
-"""The cut-off of the op's default, which "exact" settings lack."""
-MIN_SHARE = 0.25 * MIN_SPLAT_ALPHA
-"""Half of the smallest share of the light that the Gaussian at the median can take."""
-
 Pose = Float64[Tensor, "4 4"] | Callable[[float], Float64[Tensor, "4 4"]]
 """world_from_lidar, or what returns it by the seconds since the instant of the sweep."""
 
@@ -82,6 +74,8 @@ class Ranges:
     """Meters along each ray; infinite where more than half of the light passes all Gaussians."""
     alpha: Float[Tensor, " n"]
     """Coverage up to the Gaussian that is met, or by all of them."""
+    rows: Int[Tensor, " n"]
+    """Which Gaussian of ``SceneGraph.gaussians_at`` is met in the pixel of each ray; -1: none."""
     seconds: Float64[Tensor, " n"]
     """Since the instant of the sweep: when the view of each ray sees sensor and objects."""
 
@@ -121,15 +115,17 @@ def render_ranges(
         )
     like = rays.directions
     ranges, alpha = like.new_full((len(like),), torch.inf), like.new_zeros(len(like))
+    met = torch.full_like(alpha, -1, dtype=torch.int64)
     seconds = torch.zeros_like(alpha, dtype=torch.float64)
     for part in _fan(rays):
         moment = 0.0 if duration is None else part.seconds / duration
         placed = scene.gaussians_at(View(part.camera, min(max(time + moment, 0.0), 1.0)))
-        depths, alphas = _at(*median_depth(placed.gaussians, part.camera, options), part.positions.to(scene.device))
+        drawn = median_depth(placed.gaussians, part.camera, settings=options.settings, backend=options.backend)
+        depths, alphas, rows = _at(drawn, part.positions.to(scene.device))
         ranges[part.rows] = (depths / part.cosines.to(depths)).to(like)
-        alpha[part.rows] = alphas.to(like)
+        alpha[part.rows], met[part.rows] = alphas.to(like), rows.to(met.device)
         seconds[part.rows] = part.seconds
-    return Ranges(ranges, alpha, seconds)
+    return Ranges(ranges, alpha, met, seconds)
 
 
 @dataclass(frozen=True)
@@ -195,32 +191,14 @@ def _part(
     return _Part(rows.to(rays.directions.device), camera, image - corner, along[:, 2], seconds)
 
 
-def median_depth(
-    gaussians: Gaussians, camera: Camera, options: RenderOptions
-) -> tuple[Float64[Tensor, "h w"], Float64[Tensor, "h w"]]:
-    """Return depth (infinite where more than half of the light passes) and coverage of each pixel."""
-    sh = gaussians.sh
-    plain = replace(gaussians, sh=replace(sh, terms=1) if isinstance(sh, Harmonics) else sh[:, :1])  # no color is read
-
-    def sums(stop: StopRule) -> tuple[Tensor, Tensor]:
-        cut = max(options.settings.alpha_min, MIN_SPLAT_ALPHA)
-        settings = replace(options.settings, transmittance_min=0.5, stop=stop, alpha_min=cut)
-        drawn = splat(plain, camera, settings=settings, backend=options.backend, screen_gradients=False)
-        alpha = drawn.alpha.double()
-        return drawn.depth.double() * alpha.clamp(min=MIN_ALPHA), alpha
-
-    (behind, alpha), (before, alpha_before) = sums("inclusive"), sums("exclusive")
-    share = alpha - alpha_before
-    return torch.where(share > MIN_SHARE, (behind - before) / share, torch.inf), alpha
-
-
 def _at(
-    depth: Float64[Tensor, "h w"], alpha: Float64[Tensor, "h w"], positions: Float64[Tensor, "k 2"]
-) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
-    """Return depth and coverage at image positions.
+    drawn: MedianDepth, positions: Float64[Tensor, "k 2"]
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"], Int[Tensor, " k"]]:
+    """Return depth, coverage and row at image positions.
 
     Inverse depth is linear across the image of a plane. Where the four pixels around show an edge, the nearest counts.
     """
+    depth, alpha = drawn.depth.double(), drawn.alpha.double()
     column, row = positions.long().unbind(-1)
     corner = (positions - 0.5).floor()
     (right, down), (left, top) = (positions - 0.5 - corner).unbind(-1), corner.long().unbind(-1)
@@ -228,6 +206,6 @@ def _at(
     rows, columns = torch.stack((top, top, top + 1, top + 1)), torch.stack((left, left + 1, left, left + 1))
     four = depth[rows, columns]
     surface = four.amax(0) < EDGE * four.amin(0)
-    between = 1 / (weights / four).sum(0)
-    mixed = (weights * alpha[rows, columns]).sum(0)
-    return torch.where(surface, between, depth[row, column]), torch.where(surface, mixed, alpha[row, column])
+    between = torch.where(surface, 1 / (weights / four).sum(0), depth[row, column])
+    mixed = torch.where(surface, (weights * alpha[rows, columns]).sum(0), alpha[row, column])
+    return between, mixed, drawn.rows[row, column]

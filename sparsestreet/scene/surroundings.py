@@ -10,17 +10,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float, Float32, Int64
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+from torch import Tensor
 
 from sparsestreet.demand import DemandError
 from sparsestreet.geometry.cameras import distance_to_view, resized
 from sparsestreet.geometry.meshes import Mesh
+from sparsestreet.ops import median_depth
 from sparsestreet.scene.edits.ground import SPACING
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.lidar import EDGE, median_depth
+from sparsestreet.scene.lidar import EDGE
 from sparsestreet.scene.nodes.tracked import Tracked
 from sparsestreet.scene.state import RenderOptions
 from sparsestreet.types import Camera, View
@@ -100,11 +102,16 @@ def _depths(scene: SceneGraph, still: SceneGraph, view: View, options: RenderOpt
     """Draw what stands still; not known is what is behind objects. Lens and shutter do not matter to a surface."""
     camera = replace(scene.seen(view).camera, distortion=None, shutter=None)
     plain = replace(view, camera=camera)
-    depths, _ = median_depth(still.gaussians_at(plain).gaussians, camera, options)
+    depths = _median(still, plain, options)
     if len(still.nodes) < len(scene.nodes):
-        nearest, _ = median_depth(scene.gaussians_at(plain).gaussians, camera, options)
+        nearest = _median(scene, plain, options)
         depths = torch.where(nearest < _HIDDEN * depths, torch.nan, depths)
     return DepthImage(depths.float().cpu().numpy(), camera)
+
+
+def _median(scene: SceneGraph, view: View, options: RenderOptions) -> Float[Tensor, "h w"]:
+    gaussians = scene.gaussians_at(view).gaussians
+    return median_depth(gaussians, view.camera, settings=options.settings, backend=options.backend).depth
 
 
 def fused(images: Sequence[DepthImage], voxel: float) -> Mesh | None:

@@ -26,7 +26,7 @@ def naive_image(
     for row in range(view.height) if rows is None else rows:
         for column in range(view.width) if columns is None else columns:
             passed = 1.0
-            for _, mean, conic, opacity, color in splats:
+            for _, mean, conic, opacity, color, _ in splats:
                 d = np.array([column + 0.5, row + 0.5]) - mean
                 alpha = min(settings.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
                 if alpha < settings.alpha_min or passed <= settings.transmittance_min:
@@ -36,27 +36,33 @@ def naive_image(
     return image
 
 
-def naive_median_depth(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> np.ndarray:
-    """Depth of the splat behind which less than half of the light is left, of each pixel; infinite where more is."""
+def naive_median_depth(
+    gaussians: Gaussians, view: Camera, settings: SplatSettings
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each pixel the depth and row of the splat behind which at most half of the light is left, and what it and
+    those before it cover; infinite and -1 where more is left."""
     splats = sorted(_naive_splats(gaussians, view, settings), key=lambda item: item[0])
-    depth = np.full((view.height, view.width), np.inf)
+    depth, covered = np.full((view.height, view.width), np.inf), np.zeros((view.height, view.width))
+    found = np.full(depth.shape, -1)
     for row, column in np.ndindex(depth.shape):
         passed = 1.0
-        for z, mean, conic, opacity, _ in splats:
+        for z, mean, conic, opacity, _, number in splats:
             d = np.array([column + 0.5, row + 0.5]) - mean
             alpha = min(settings.alpha_max, opacity * np.exp(-0.5 * d @ conic @ d))
             passed *= 1 - (alpha if alpha >= settings.alpha_min else 0.0)
-            if passed < 0.5:
-                depth[row, column] = z
+            covered[row, column] = 1 - passed
+            if passed <= 0.5:
+                depth[row, column], found[row, column] = z, number
                 break
-    return depth
+    return depth, found, covered
 
 
 def _naive_splats(gaussians: Gaussians, view: Camera, settings: SplatSettings) -> list[tuple]:
     pose, intrinsics = view.camera_from_world.double().numpy(), view.intrinsics.double().numpy()
     fx, fy, cx, cy = intrinsics[0, 0], intrinsics[1, 1], intrinsics[0, 2], intrinsics[1, 2]
     splats = []
-    for mean, q, scale, opacity, sh in zip(*(getattr(gaussians, name).numpy() for name in FIELDS), strict=True):
+    fields = (getattr(gaussians, name).numpy() for name in FIELDS)
+    for number, (mean, q, scale, opacity, sh) in enumerate(zip(*fields, strict=True)):
         x, y, z = pose[:3, :3] @ mean + pose[:3, 3]
         if z <= settings.near_plane:
             continue
@@ -67,7 +73,7 @@ def _naive_splats(gaussians: Gaussians, view: Camera, settings: SplatSettings) -
         half = jacobian @ pose[:3, :3] @ rotation_matrix(q) @ np.diag(scale)
         conic = np.linalg.inv(half @ half.T + settings.eps2d * np.eye(2))
         color = np.maximum(0, 0.5 + sh[0] / (2 * np.sqrt(np.pi)))
-        splats.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), conic, opacity, color))
+        splats.append((z, np.array([fx * x / z + cx, fy * y / z + cy]), conic, opacity, color, number))
     return splats
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 LIBRARY_NAME = "libsparsestreet_splat.so"
 LIBRARY_VARIABLE = "SPARSESTREET_SPLAT_LIBRARY"
 """Environment variable that names another build of the library, to measure and test it."""
-_INTERFACE_VERSION = 18
+_INTERFACE_VERSION = 19
 _LOADED_IN = os.getpid()
 
 STATUS_OK, STATUS_BAD_VALUE, STATUS_TOO_MANY_PAIRS, STATUS_OUT_OF_MEMORY = range(4)
@@ -243,6 +243,7 @@ def _declare(library: ctypes.CDLL) -> None:
         "splat_sample_count": (c_int64, (c_void_p,)),
         "splat_forward": (c_int32, (c_void_p,) * 6),
         "splat_backward": (c_int32, (c_void_p,) * 6),
+        "splat_finishers": (None, (c_void_p,) * 4),
         "splat_contribution": (c_int32, (c_void_p,) * 5),
         "splat_leave_one_out": (c_int32, (c_void_p,) * 6),
         "splat_gather": (c_int32, (c_void_p, c_void_p, c_int64, c_void_p, c_void_p, c_void_p)),

@@ -16,7 +16,7 @@ from sparsestreet.ops.raster import COUNTINGS, SHAPE, LeaveOneOutSums, PairLimit
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype, check_values
 from sparsestreet.phases import phase
-from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, MedianDepth
 
 PAIR_LIMIT = 1 << 28
 """Most (splat, tile) pairs of one rendering. A pair takes 26 to 28 bytes forward and 48 more backward in float32, and
@@ -71,6 +71,45 @@ def leave_one_out(
     return LeaveOneOut(largest, squared, weight)
 
 
+@torch.no_grad()
+def median_depth(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> MedianDepth:
+    """Which splat finished each pixel; ``settings`` stop inclusively at half of the light."""
+    check_dtype(gaussians, "backend 'cpu'")
+    view, lease = _view(camera, settings), Lease(gaussians.means.dtype, FASTEST_VARIANT)
+    fields = tuple(field.detach().contiguous() for field in gaussians.learned())
+    _, transmittance, _, _ = _drawn(lease, view, fields, gaussians.terms, _moved(gaussians), None)
+    depth, rows = torch.full_like(transmittance, torch.inf), torch.full(transmittance.shape, -1)
+    native.load_library().splat_finishers(
+        lease.workspace.handle, byref(view), transmittance.data_ptr(), byref(native.pointers(rows, depth))
+    )
+    return MedianDepth(depth, rows, 1 - transmittance)
+
+
+def _drawn(
+    lease: Lease,
+    view: native.CView,
+    fields: Sequence[Tensor],
+    terms: int | None,
+    displacements: Tensor | None,
+    gates: Tensor | None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Layers of a raster. The lists of its tiles stay in the workspace."""
+    means, report = fields[0], native.CReport()
+    rgb = means.new_empty(view.height, view.width, 3)
+    transmittance, depth_sum = means.new_empty(2, view.height, view.width)
+    radii = means.new_empty(means.shape[0])
+    status = native.load_library().splat_forward(
+        lease.workspace.handle,
+        byref(view),
+        byref(_rows(fields, terms, displacements, gates)),
+        byref(native.pointers(rgb, transmittance, depth_sum)),
+        radii.data_ptr(),
+        byref(report),
+    )
+    _raise_for(status, fields, terms, displacements, report)
+    return rgb, transmittance, depth_sum, radii
+
+
 def _measure(
     function: str, gaussians: Gaussians, camera: Camera, settings: SplatSettings, *structs: Array[c_void_p]
 ) -> None:
@@ -96,20 +135,8 @@ class _Blend(torch.autograd.Function):
     def forward(ctx, screen_offsets, gates, displacements, view, variant, changes, terms, *fields):
         ctx.set_materialize_grads(False)
         fields = tuple(field.contiguous() for field in fields)
-        means, gates = fields[0], None if gates is None else gates.contiguous()
-        rgb = means.new_empty(view.height, view.width, 3)
-        transmittance, depth_sum = means.new_empty(2, view.height, view.width)
-        radii = means.new_empty(means.shape[0])
-        lease, report = Lease(means.dtype, variant), native.CReport()
-        status = native.load_library().splat_forward(
-            lease.workspace.handle,
-            byref(view),
-            byref(_rows(fields, terms, displacements, gates)),
-            byref(native.pointers(rgb, transmittance, depth_sum)),
-            radii.data_ptr(),
-            byref(report),
-        )
-        _raise_for(status, fields, terms, displacements, report)
+        gates, lease = None if gates is None else gates.contiguous(), Lease(fields[0].dtype, variant)
+        rgb, transmittance, depth_sum, radii = _drawn(lease, view, fields, terms, displacements, gates)
         ctx.mark_non_differentiable(radii)
         ctx.save_for_backward(*fields, gates, displacements, transmittance, None if changes is None else rgb)
         ctx.view, ctx.lease, ctx.changes, ctx.terms = view, lease, changes, terms

@@ -11,7 +11,7 @@ from sparsestreet.ops.raster import LeaveOneOutSums, Raster
 from sparsestreet.ops.reference.projection import Splats, on_screen, visible_rows
 from sparsestreet.ops.settings import SplatSettings
 from sparsestreet.ops.validate import check_dtype
-from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, MedianDepth
 
 _CHUNK_ELEMENTS = 1 << 20
 
@@ -80,6 +80,26 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
         first = (weights == weights.amax(0)).to(torch.int8).cumsum(0).eq(0).sum(0)
         dominant[rows] += torch.bincount(first[touched.any(0)], minlength=len(rows))
     return Contribution(weight, pixels, dominant)
+
+
+@torch.no_grad()
+def median_depth(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> MedianDepth:
+    """Which splat finished each pixel; ``settings`` stop inclusively at half of the light."""
+    check_dtype(gaussians, "backend 'reference'")
+    rows, shape = visible_rows(gaussians, camera, settings), (camera.height, camera.width)
+    splats = on_screen(gaussians, rows, camera, settings)
+    numbers, still = torch.arange(len(rows), device=rows.device)[:, None], torch.zeros_like(splats.means)
+    lasts, lights = [], []
+    for chunk in _pixel_chunks(camera, splats):
+        weights, transmittance = _weights(_alphas(chunk, splats, still, settings), settings)
+        drawn = torch.where(weights > 0, numbers, -1)
+        lasts.append(torch.cat((drawn, drawn.new_full((1, len(chunk)), -1))).amax(0))
+        lights.append(transmittance)
+    passed, last = torch.cat(lights).reshape(shape), torch.cat(lasts).reshape(shape)
+    met = passed <= settings.transmittance_min
+    depth, found = splats.depths.new_full(shape, torch.inf), rows.new_full(shape, -1)
+    depth[met], found[met] = splats.depths[last[met]], rows[last[met]]
+    return MedianDepth(depth, found, 1 - passed)
 
 
 @torch.no_grad()

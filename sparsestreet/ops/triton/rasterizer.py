@@ -17,8 +17,8 @@ from sparsestreet.ops.triton.launch import is_interpreted
 from sparsestreet.ops.triton.passes import Asked, Cotangents, Inputs, counted, differentiate, removed
 from sparsestreet.ops.triton.pixels import Ends, blend_view
 from sparsestreet.ops.triton.screen import contiguous, draw, fields_of, project
-from sparsestreet.ops.triton.view import KernelView
-from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, Rendering
+from sparsestreet.ops.triton.view import DEPTH_PLACE, KernelView
+from sparsestreet.types import Camera, Contribution, Gaussians, LeaveOneOut, MedianDepth, Rendering
 
 
 def render(
@@ -52,6 +52,21 @@ def contribution(gaussians: Gaussians, camera: Camera, settings: SplatSettings) 
     view = KernelView.of(camera, settings)
     weight, pixels, dominant = counted(project(gaussians, view), view, len(gaussians)).unbind(-1)
     return Contribution(weight, pixels.long(), dominant.long())
+
+
+@torch.no_grad()
+def median_depth(gaussians: Gaussians, camera: Camera, settings: SplatSettings) -> MedianDepth:
+    """Which splat finished each pixel; ``settings`` stop inclusively at half of the light."""
+    _check(gaussians)
+    view = KernelView.of(camera, settings)
+    screen = project(gaussians, view)
+    drawn = blend_view(screen, view, lasts=True)
+    lasts, met = drawn.ends.lasts, drawn.ends.transmittance <= view.transmittance_min
+    assert lasts is not None  # as it was asked for
+    rows, depth = torch.full_like(lasts, -1), torch.full_like(drawn.depth, torch.inf)
+    rows[met] = screen.lists.pair_rows[lasts[met].long() - 1] & (MAX_ROWS - 1)
+    depth[met] = screen.records[rows[met].long(), DEPTH_PLACE]
+    return MedianDepth(depth, rows.long(), drawn.alpha)
 
 
 @torch.no_grad()

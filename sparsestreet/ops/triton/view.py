@@ -21,7 +21,9 @@ LENGTH = 12
 RECORD = constant(LENGTH)
 X, Y, L11, L21, L22, LOG2_OPACITY = (constant(i) for i in range(6))
 # The exponent of 2 below which the splat is not drawn; then the color's three numbers and the depth.
-CUTOFF, COLOR, DEPTH = constant(6), constant(7), constant(10)
+CUTOFF, COLOR = constant(6), constant(7)
+DEPTH_PLACE = 10
+DEPTH = constant(DEPTH_PLACE)
 # Written where rows have gates; of those without, nothing reads it.
 GATE_PLACE = 11
 GATE = constant(GATE_PLACE)

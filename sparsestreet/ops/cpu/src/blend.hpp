@@ -98,4 +98,19 @@ void blend(Workspace<T>& ws, const View& view, bool gated, const Layers& image) 
   ws.seconds[BLEND] = omp_get_wtime() - start;
 }
 
+// Of each pixel that is finished: the row of the splat that finished it, and its depth; others stay as they are. After
+// an inclusive blend, whose lists are still there.
+template <class T>
+void write_finishers(const Workspace<T>& ws, const View& view, const T* transmittance, const Finishers& out) {
+  T* depth = static_cast<T*>(out.depth);
+#pragma omp parallel for num_threads(view.threads) schedule(static)
+  for (int64_t tile = 0; tile < ws.tiles_x * ws.tiles_y; ++tile) {
+    for_each_pixel(view, tile % ws.tiles_x * TILE, tile / ws.tiles_x * TILE, [&](int at, int64_t pixel) {
+      if (transmittance[pixel] > T(view.transmittance_min)) return;
+      const int64_t row = ws.pairs[ws.tile_begin[tile] + int64_t(ws.last_pairs[tile * PIXELS + at])].row;
+      out.rows[pixel] = row, depth[pixel] = ws.splats[row].depth;
+    });
+  }
+}
+
 }  // namespace SPLAT_VARIANT

@@ -4,7 +4,7 @@
 
 namespace splat {
 
-constexpr int32_t INTERFACE_VERSION = 18;
+constexpr int32_t INTERFACE_VERSION = 19;
 
 // Side of the square tiles, pixels: the build's SPARSESTREET_TILE (CMakeLists.txt).
 constexpr int TILE = SPLAT_TILE;
@@ -64,6 +64,12 @@ struct RowGradients {
 struct Counters {
   double* weight;
   int64_t *pixels, *dominant;
+};
+
+// What finished each pixel [h,w]: a row and its depth.
+struct Finishers {
+  int64_t* rows;
+  void* depth;
 };
 
 // In how many ways squared changes can be counted at once.

@@ -18,6 +18,7 @@ struct RowKernels {
 
 struct PixelKernels {
   void (*blend)(void*, const View&, bool gated, const Layers&);
+  void (*finishers)(void*, const View&, const void* transmittance, const Finishers&);
   // `gates`: where the gradients of the gates of all `rows` go; null: there are none.
   void (*blend_backward)(void*, const View&, const void* transmittance, const Layers& cotangents, int64_t rows,
                          void* gates);

@@ -148,6 +148,11 @@ SPLAT_API int32_t splat_backward(Handle* h, const View* view, const Rows* rows, 
   });
 }
 
+// What finished the pixels of the view that splat_forward has left in the workspace.
+SPLAT_API void splat_finishers(Handle* h, const View* view, const void* transmittance, const Finishers* out) {
+  h->pixels().finishers(h->workspace, *view, transmittance, *out);
+}
+
 SPLAT_API int32_t splat_contribution(Handle* h, const View* view, const Rows* rows, const Counters* counters,
                                      Report* report) {
   return guarded([&]() -> int32_t {

@@ -14,6 +14,9 @@ Workspace<T>& as(void* workspace) { return *static_cast<Workspace<T>*>(workspace
 template <class T>
 PixelKernels kernels() {
   return {[](void* w, const View& v, bool gated, const Layers& image) { blend(as<T>(w), v, gated, image); },
+          [](void* w, const View& v, const void* transmittance, const Finishers& out) {
+            write_finishers(as<T>(w), v, static_cast<const T*>(transmittance), out);
+          },
           [](void* w, const View& v, const void* transmittance, const Layers& cotangents, int64_t rows, void* gates) {
             blend_backward(as<T>(w), v, static_cast<const T*>(transmittance), cotangents, rows, static_cast<T*>(gates));
           },
