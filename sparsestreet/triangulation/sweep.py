@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from torch import Tensor
 
 from sparsestreet.data.lazy import Frames
+from sparsestreet.data.lidar import near_returns
 from sparsestreet.geometry.boxes import box_at, through_box
 from sparsestreet.geometry.cameras import inverse, project, resized
 from sparsestreet.geometry.lenses import distort
@@ -43,6 +44,8 @@ RIVAL = 1.12, 0.05
 """A depth that differs by more than this factor must score less by so much: patterns repeat along a wall."""
 AGREEMENT = 0.05, 2, 3
 """Relative difference of depths that agree, how many neighbors must, of how many swept before and as many after."""
+NEAR_RETURNS = 0.005
+"""Share of the longer side of an image within which a return says more than the sweep: planes are 2.5 % apart."""
 _EPSILON = 1e-7
 """Added to the product of two variances of gray, so that evenly painted things look like nothing."""
 
@@ -58,6 +61,8 @@ class _Image:
     colors: UInt8[np.ndarray, "h w 3"]
     solid: Bool[np.ndarray, "h w"]
     """Neither sky nor recording car."""
+    measured: Bool[Tensor, "h w"] | None
+    """Pixels of the image as it was recorded that lie near a return; None: no lidar."""
 
 
 def swept_points(
@@ -176,7 +181,8 @@ def _image(frame: Frame, width: int) -> _Image:
         hidden = cv2.remap(hidden, columns, rows, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
     gray = cv2.cvtColor(colors, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255 - np.float32(0.5)
     view = View(frame.camera, frame.time, frame.frame_index, frame.camera_index, frame.seconds, frame.stamp)
-    return _Image(view, camera, gray, colors, hidden == 0)
+    measured = None if frame.depth is None else near_returns(frame.depth, NEAR_RETURNS)
+    return _Image(view, camera, gray, colors, hidden == 0, measured)
 
 
 def _through_lens(
@@ -321,7 +327,7 @@ def _world(camera: Camera, points: Float64[np.ndarray, "n 3"]) -> Float64[np.nda
 def _points(
     image: _Image, place: int, depth: Float32[np.ndarray, "h w"], moving: Sequence[Track]
 ) -> TriangulatedPoints:
-    """The points of a view with these depths that no moving box may hide and that its lens shows."""
+    """The points of a view with these depths that no moving box may hide, that its lens shows and no lidar measured."""
     rows, columns = np.nonzero(depth)
     rays = _rays(image.camera)[rows, columns]
     pose, view = image.camera.camera_from_world.double(), image.view
@@ -331,6 +337,9 @@ def _points(
         world_from_box = box_at(track, view.indices[0], view.time)
         if world_from_box is not None:
             counts &= ~through_box(pose @ world_from_box, torch.from_numpy(rays), ENLARGEMENT * track.size)
+    if image.measured is not None:
+        column, row = pixels[counts].long().unbind(1)
+        counts[counts.clone()] = ~image.measured[row, column]
     sizes, count = depths / view.camera.intrinsics[0, 0], int(counts.sum())
     return TriangulatedPoints(
         positions[counts].float().numpy(),
