@@ -3,6 +3,9 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+from jaxtyping import Float
+from torch import Tensor
+
 from sparsestreet.data.frame_cache import MemoryForecast
 from sparsestreet.types import Frame, Sweep, View
 
@@ -88,12 +91,15 @@ class Sweeps(LazySequence):
         load: Callable[[int], Sweep],
         load_gray: Callable[[int], Sweep] | None = None,
         stamps: Mapping[int, int] | None = None,
+        load_intensities: Callable[[int], Float[Tensor, " n"] | None] = lambda index: None,
     ) -> None:
         """``load_gray`` makes the same sweep without its colors, where that is cheaper; ``stamps`` of the sweeps, by
-        their frames, are known without reading any."""
+        their frames, are known without reading any. ``load_intensities`` reads those of a frame's returns, in [0, 1];
+        None: the log has none."""
         super().__init__(indices, load)
         self.load_gray = load if load_gray is None else load_gray
         self.stamps = {} if stamps is None else stamps
+        self.load_intensities = load_intensities
 
     @classmethod
     def of(cls, sweeps: "Sweeps | tuple[Sweep, ...]") -> "Sweeps":
@@ -118,4 +124,4 @@ class Sweeps(LazySequence):
         return map(self.load_gray, self.keys)
 
     def _of(self, keys: Iterable[int]) -> "Sweeps":
-        return Sweeps(keys, self.load, self.load_gray, self.stamps)
+        return Sweeps(keys, self.load, self.load_gray, self.stamps, self.load_intensities)

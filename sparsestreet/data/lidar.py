@@ -39,8 +39,21 @@ def check_points(points: Float64[Tensor, "n 3"], path: Path, *, remedy: str = "d
         raise fault(path, message, remedy)
 
 
-def sensor_points(path: Path, columns: int, *, max_bytes: int, remedy: str) -> Float64[Tensor, "n 3"]:
-    """Points of rows of float32, which begin with x, y, z. Raises LogError, naming the file, for one that has none."""
+def unit_intensities(values: np.ndarray, brightest: float | None) -> Float[Tensor, " n"]:
+    """Return intensities in [0, 1] of a sweep's own numbers: what is above the brightest is cut off, what is no number
+    is 0. None: the brightest is 255 in a sweep with any above 1, and else 1."""
+    numbers = np.nan_to_num(values.astype(np.float32))
+    if brightest is None:
+        brightest = 255.0 if (numbers > 1).any() else 1.0
+    return torch.from_numpy(numbers / np.float32(brightest)).clamp(0, 1)
+
+
+def sensor_returns(
+    path: Path, columns: int, brightest: float, *, max_bytes: int, remedy: str
+) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """Points and intensities of rows of float32, which begin with x, y, z, intensity.
+
+    Raises LogError, naming the file, for one that has none."""
     try:
         size = path.stat().st_size
         if size % (4 * columns) or size > max_bytes:
@@ -52,7 +65,7 @@ def sensor_points(path: Path, columns: int, *, max_bytes: int, remedy: str) -> F
         raise fault(path, f"the sweep cannot be read ({error})", remedy) from error
     points = torch.from_numpy(rows[:, :3].copy()).double()
     check_points(points, path, remedy=remedy)
-    return points
+    return points, unit_intensities(rows[:, 3], brightest)
 
 
 def returned(points: Float64[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
@@ -172,7 +185,7 @@ def recolored(log: DrivingLog, parts: Split) -> Sweeps:
         at = [carried(sweep).at(view.time) for view in views]
         return replace(sweep, colored=seen_points(sweep.points, [view.camera for view in views], at))
 
-    return Sweeps(log.sweeps.indices, load, load_gray)
+    return Sweeps(log.sweeps.indices, load, load_gray, load_intensities=log.sweeps.load_intensities)
 
 
 MAX_FRAMES = 36

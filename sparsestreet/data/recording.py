@@ -61,6 +61,7 @@ class SceneFolder:
         tracks: Sequence[Track] = (),
         sweep_stamps: Mapping[int, int] | None = None,
         origins: Callable[[int], Float64[Tensor, "3"] | None] = lambda index: None,
+        read_intensities: Callable[[int], Float[Tensor, " n"] | None] = lambda index: None,
     ) -> None:
         """
         Args:
@@ -73,6 +74,7 @@ class SceneFolder:
             tracks: objects that carry points, with the times of their boxes.
             sweep_stamps: frame index -> stamp of its sweep, where that is not the frame's.
             origins: where the lidar of a frame index stood, in the log's world; None: nobody knows.
+            read_intensities: of the points of a frame index, in [0, 1]; None: the log has none.
         """
         self._cache_bytes = cache_bytes
         self._views: dict[int, list[View]] = {}
@@ -83,7 +85,7 @@ class SceneFolder:
         self._sweep_stamps = sweep_stamps or {}
         self._check = check
         self._read_points = read_points
-        self._origins = origins
+        self._origins, self._read_intensities = origins, read_intensities
         self._use(tracks, frozenset())
 
     def _use(self, tracks: Sequence[Track], held_out: frozenset[int]) -> None:
@@ -119,6 +121,7 @@ class SceneFolder:
             lambda index: self._explained(lambda: self._sweep(index, points)),
             lambda index: self._explained(lambda: self._gray_sweep(index, points)),
             {index: stamp for index in self._views if (stamp := self._moment(index)[1]) is not None},
+            lambda index: self._explained(lambda: self._read_intensities(index)),
         )
 
     def _frame(self, view: View) -> Frame:
@@ -180,6 +183,8 @@ class LidarSweep:
     """Nanoseconds at which the points are where they are."""
     origin: Float64[Tensor, "3"] | None = None
     """Where the lidar stood then (of several: the main one), in the data set's own world; None: it is not told."""
+    intensities: Callable[[], Float[Tensor, " n"]] | None = None
+    """Reads those of the points, in [0, 1]; None: the data set has none. Raises as ``read``."""
 
 
 @dataclass(frozen=True)
@@ -350,18 +355,22 @@ def ahead_only(recording: Recording, ahead: Sequence[float | int]) -> Recording:
         note = f"lidar_ahead={list(ahead)} has no effect: {why}"
         return replace(recording, notes=(*recording.notes, note))
 
-    def read(sweep: LidarSweep, stamp: int) -> Float64[Tensor, "n 3"]:
-        points, when = sweep.read(), torch.tensor([stamp]).clamp(path.stamps[0], path.stamps[-1])
-        x = transform_points(inverse(path.at(when)[0]), points)[:, 0]
-        return points[(x > ahead[0]) & (x < ahead[1])]
+    def kept(sweep: LidarSweep, stamp: int, values: Callable[[], Float[Tensor, "n ..."]]) -> Float[Tensor, "k ..."]:
+        when = torch.tensor([stamp]).clamp(path.stamps[0], path.stamps[-1])
+        x = transform_points(inverse(path.at(when)[0]), sweep.read())[:, 0]
+        return values()[(x > ahead[0]) & (x < ahead[1])]
 
-    cut = {
-        # Behind the last image there are no frames, and no sweep is read.
-        index: replace(sweep, read=partial(read, sweep, stamps[index] if sweep.stamp is None else sweep.stamp))
+    def cut(sweep: LidarSweep, stamp: int) -> LidarSweep:
+        some = None if sweep.intensities is None else partial(kept, sweep, stamp, sweep.intensities)
+        return replace(sweep, read=partial(kept, sweep, stamp, sweep.read), intensities=some)
+
+    # Behind the last image there are no frames, and no sweep is read.
+    ahead_of = {
+        index: cut(sweep, stamps[index] if sweep.stamp is None else sweep.stamp)
         for index, sweep in sweeps.items()
         if index < len(stamps)
     }
-    return replace(recording, sweeps=cut)
+    return replace(recording, sweeps=ahead_of)
 
 
 def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[], list[Problem]]) -> DrivingLog:
@@ -398,6 +407,7 @@ def log_of(recording: Recording, *, cache_bytes: int | None, check: Callable[[],
         tracks=tracks,
         sweep_stamps=_sweep_stamps(recording, num_frames),
         origins=partial(_origin, recording.sweeps or {}, origin),
+        read_intensities=partial(_intensities, recording.sweeps or {}),
     )
     return DrivingLog(
         name=recording.name,
@@ -514,6 +524,13 @@ def _points(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], inde
     if index not in sweeps:
         return torch.zeros(0, 3)
     return (sweeps[index].read() - origin).float()
+
+
+def _intensities(sweeps: Mapping[int, LidarSweep], index: int) -> Float[Tensor, " n"] | None:
+    if index not in sweeps:
+        return torch.zeros(0)
+    read = sweeps[index].intensities
+    return None if read is None else read()
 
 
 def _origin(sweeps: Mapping[int, LidarSweep], origin: Float64[Tensor, "3"], index: int) -> Float64[Tensor, "3"] | None:

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float64
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -28,7 +28,8 @@ from sparsestreet.records.geometry import (
 )
 from sparsestreet.records.summary import HELD_OUT, TRAINING
 from sparsestreet.scene.graph import SceneGraph
-from sparsestreet.scene.lidar import PIXEL, PIXELS, Rays, render_ranges
+from sparsestreet.scene.intensities import intensities_of
+from sparsestreet.scene.lidar import PIXEL, Ranges, rays_to, render_ranges
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.types import Sweep, Track
 
@@ -36,8 +37,6 @@ MAX_SWEEPS = 20
 """Measured of a log, spread over its length."""
 MAX_RAYS = 20_000
 """Measured of a sweep: every second, third, ... return of one with more."""
-MIN_RANGE = 0.5
-"""Meters: nearer returns are of the recording car, as in the depth term."""
 
 
 @torch.no_grad()
@@ -55,15 +54,22 @@ def measure_geometry(
     Raises ValueError for a scene with numbers that are not finite.
     """
     split, sweeps = _measured(log.sweeps, held_out)
-    found = {sweep.index: _compared(scene, sweep, log.tracks, options) for sweep in sweeps.gray() if _is_usable(sweep)}
+    found = {
+        sweep.index: _compared(scene, sweep, sweeps.load_intensities(sweep.index), log.tracks, options)
+        for sweep in sweeps.gray()
+        if _is_usable(sweep)
+    }
     if not found:
         return None
+    recorded, drawn = np.concatenate([one.intensities for one in found.values()], 1)
     return Geometry(
         split=split,
         sweeps=tuple(found),
         strides=tuple(one.stride for one in found.values()),
         pixel=math.degrees(PIXEL),
         groups=_errors(list(found.values())),
+        intensity_error=float(np.abs(drawn - recorded).mean()) if len(recorded) else None,
+        intensity_spread=float(np.abs(recorded - np.median(recorded)).mean()) if len(recorded) else None,
     )
 
 
@@ -86,6 +92,8 @@ class _Compared:
     """Ranges, meters."""
     drawn: Float64[np.ndarray, " n"]
     """Ranges, meters; infinite where nothing is met."""
+    intensities: Float64[np.ndarray, "2 k"]
+    """Recorded and drawn, of rays whose range is right; none where log or scene have none."""
     to_drawn: Float64[np.ndarray, " n"]
     """Meters from the recorded point to the nearest drawn one of the sweep; infinite where there is none."""
     to_recorded: Float64[np.ndarray, " n"]
@@ -93,29 +101,39 @@ class _Compared:
     groups: Mapping[str, Bool[np.ndarray, " n"]]
 
 
-def _compared(scene: SceneGraph, sweep: Sweep, tracks: Sequence[Track], options: RenderOptions) -> _Compared:
-    """Draw the rays of a sweep from its origin, with the axes of the world."""
-    assert sweep.origin is not None  # as _is_usable says
-    away = sweep.points.double() - sweep.origin
-    ranges = away.norm(dim=-1)
-    rows = torch.nonzero(ranges > MIN_RANGE).squeeze(-1)
+def _compared(
+    scene: SceneGraph,
+    sweep: Sweep,
+    values: Float[Tensor, " n"] | None,
+    tracks: Sequence[Track],
+    options: RenderOptions,
+) -> _Compared:
+    """Draw the rays of a sweep with these intensities from its origin, with the axes of the world."""
+    rows, ranges, rays = rays_to(sweep)
     stride = max(1, math.ceil(len(rows) / MAX_RAYS))
-    rows = rows[::stride]
-    world_from_lidar = torch.eye(4, dtype=torch.float64)
-    world_from_lidar[:3, 3] = sweep.origin
-    away, ranges = away[rows], ranges[rows]
-    directions = away / ranges[:, None]
-    rays = Rays(directions.float(), world_from_lidar, (PIXELS * PIXEL, PIXELS * PIXEL))
-    drawn = render_ranges(scene, rays, sweep.time, options).ranges.double()
+    rows, ranges, directions = rows[::stride], ranges[::stride], rays.directions[::stride]
+    met = render_ranges(scene, replace(rays, directions=directions), sweep.time, options)
+    drawn, directions = met.ranges.double(), directions.double()
     groups = _groups(sweep, tracks)
     return _Compared(
         stride,
         ranges.numpy(),
         drawn.numpy(),
-        *_nearest(away.numpy(), (drawn[:, None] * directions).numpy()),
+        np.zeros((2, 0)) if values is None else _intensities(scene, met, ranges, values[rows]),
+        *_nearest((ranges[:, None] * directions).numpy(), (drawn[:, None] * directions).numpy()),
         {name: members[rows].numpy() for name, members in groups.items()}
         | {name: ((ranges >= near) & (ranges < far)).numpy() for name, (near, far) in DISTANCES.items()},
     )
+
+
+def _intensities(
+    scene: SceneGraph, met: Ranges, ranges: Float64[Tensor, " n"], recorded: Float[Tensor, " n"]
+) -> Float64[np.ndarray, "2 k"]:
+    table = intensities_of(scene)
+    if table is None:
+        return np.zeros((2, 0))
+    right = (met.ranges.double() - ranges).abs() <= WITHIN
+    return torch.stack((recorded[right], table.cpu()[met.rows[right]])).double().numpy()
 
 
 def _nearest(

@@ -54,6 +54,10 @@ class Geometry:
     """Degrees that a pixel of the drawn views measures in their middle."""
     groups: dict[str, RangeErrors]
     """Name of a group of ``GROUPS`` -> its errors."""
+    intensity_error: float | None = None
+    """Mean absolute error of intensities in [0, 1], of rays drawn within ``WITHIN``; None: log or scene have none."""
+    intensity_spread: float | None = None
+    """The same if each had the median of the recorded ones: what knowing nothing costs."""
 
     def __post_init__(self) -> None:
         unknown = sorted(self.groups.keys() - set(GROUPS))

@@ -9,6 +9,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+INTENSITIES = "intensities"
+"""Column of lidar intensities, which is there once they are learned (``scene.intensities``)."""
+
 
 @dataclass(frozen=True)
 class RowPlan:
@@ -160,10 +163,12 @@ class Rows(nn.Module):
             raise ValueError(f"the optimizer does not hold the columns {missing}: build it after the scene was loaded")
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
-        """Take the number of rows from the checkpoint, and drops transient columns that it lacks.
+        """Take the number of rows from the checkpoint, drop transient columns that it lacks, add intensities it has.
 
         Load before you build an optimizer, because parameters of another length are replaced.
         """
+        if prefix + INTENSITIES in state_dict:
+            self.register_buffer(INTENSITIES, torch.empty_like(state_dict[prefix + INTENSITIES]))
         for name, column in self.columns().items():
             saved = state_dict.get(prefix + name)
             if saved is None and name in self.transient:

@@ -17,7 +17,7 @@ from sparsestreet.geometry.cameras import inverse
 from sparsestreet.ops import median_depth
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.state import DEFAULT_OPTIONS, RenderOptions
-from sparsestreet.types import Camera, MedianDepth, View
+from sparsestreet.types import Camera, MedianDepth, Sweep, View
 
 VIEWS = 8
 """Level views of 360 / 8 degrees. Twelve see nothing better."""
@@ -64,6 +64,27 @@ class Rays:
     def pose(self, seconds: float) -> Float64[Tensor, "4 4"]:
         """Return world_from_lidar at a time since the instant of the sweep."""
         return self.world_from_lidar(seconds) if callable(self.world_from_lidar) else self.world_from_lidar
+
+
+MIN_RANGE = 0.5
+"""Meters: nearer returns are of the recording car, as in the depth term."""
+
+
+def rays_to(sweep: Sweep) -> tuple[Int[Tensor, " k"], Float64[Tensor, " k"], Rays]:
+    """Return which points of a sweep are not of the recording car, their ranges, and the rays that end there, with the
+    axes of the world.
+
+    Raises ValueError for a sweep whose origin is not known.
+    """
+    if sweep.origin is None:
+        raise ValueError(f"nobody knows where the lidar of sweep {sweep.index} stood: leave the sweep out")
+    away = sweep.points.double() - sweep.origin
+    ranges = away.norm(dim=-1)
+    rows = torch.nonzero(ranges > MIN_RANGE).squeeze(-1)
+    world_from_lidar = torch.eye(4, dtype=torch.float64)
+    world_from_lidar[:3, 3] = sweep.origin
+    directions = (away[rows] / ranges[rows, None]).float()
+    return rows, ranges[rows], Rays(directions, world_from_lidar, (PIXELS * PIXEL, PIXELS * PIXEL))
 
 
 @dataclass(frozen=True)

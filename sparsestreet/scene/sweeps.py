@@ -10,6 +10,7 @@ from torch import Tensor
 from sparsestreet.data.lidar_models import LidarModel
 from sparsestreet.geometry.cameras import inverse, transform_points
 from sparsestreet.scene.graph import SceneGraph
+from sparsestreet.scene.intensities import intensities_of
 from sparsestreet.scene.lidar import PIXEL, PIXELS, Rays, render_ranges
 from sparsestreet.scene.state import DEFAULT_OPTIONS, RenderOptions
 
@@ -21,7 +22,7 @@ class Returns:
     points: Float64[Tensor, "n 3"]
     """Meters, in the frame of the lidar at the instant of the sweep."""
     intensities: Float64[Tensor, " n"]
-    """In [0, 1]; 0, because no scene has learned any."""
+    """In [0, 1]; 0 where the scene has learned none."""
     seconds: Float64[Tensor, " n"]
     """When each was fired, since that instant."""
 
@@ -66,4 +67,6 @@ def render_sweep(
     for moment in drawn_at.unique().tolist():
         rows = drawn_at == moment
         points[rows] = transform_points(lidar_from_world @ world_from_lidar(moment), own[rows])
-    return Returns(points, torch.zeros(len(points), dtype=torch.float64), seconds[kept])
+    table = intensities_of(scene)
+    intensities = torch.zeros(len(points)) if table is None else table.cpu()[met.rows[kept]]
+    return Returns(points, intensities.double(), seconds[kept])

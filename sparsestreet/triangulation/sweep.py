@@ -61,7 +61,7 @@ class _Image:
     colors: UInt8[np.ndarray, "h w 3"]
     solid: Bool[np.ndarray, "h w"]
     """Neither sky nor recording car."""
-    measured: Bool[Tensor, "h w"] | None
+    measured: Bool[Tensor, "rows columns"] | None
     """Pixels of the image as it was recorded that lie near a return; None: no lidar."""
 
 

@@ -142,6 +142,11 @@ class Plan:
         return pose(turned(angle, -0.03), path + np.array(self.origin))
 
 
+def levels(count: int) -> np.ndarray:
+    """Intensities of the returns of a sweep in their order, in [0, 1]: numbers of one byte, no two neighbors alike."""
+    return 37 * np.arange(count) % 256 / 255
+
+
 def check_same_views(found: DrivingLog, wanted: DrivingLog) -> None:
     """Poses in the data set's world, lenses, sizes, times and stamps."""
     assert [view.indices for view in found.views] == [view.indices for view in wanted.views]

@@ -284,12 +284,17 @@ def test_returns_ahead_of_the_vehicle():
     moments = {frame: stamp + 30_000_000 * (frame - 1) for frame, stamp in enumerate(stamps)}
     timed = recording(
         vehicle=replace(path, stamps=path.stamps[1:], poses=path.poses[1:]),
-        sweeps={frame: LidarSweep(partial(sweep, frame), stamp) for frame, stamp in moments.items()},
+        sweeps={
+            frame: LidarSweep(partial(sweep, frame), stamp, intensities=lambda frame=frame: sweep(frame)[:, 0].float())
+            for frame, stamp in moments.items()
+        },
     )
     for frame, stamp in moments.items():
         nearest = torch.tensor([stamp]).clamp(stamps[1], stamps[-1])
         x = moved(np.linalg.inv(path.at(nearest)[0].numpy()), sweep(frame).numpy())[:, 0]
-        found = there(ahead_only(timed, (-3.0, 11)).sweeps)[frame].read()
+        cut = there(ahead_only(timed, (-3.0, 11)).sweeps)[frame]
+        found = cut.read()
+        assert torch.equal(there(cut.intensities)(), found[:, 0].float())
         assert torch.equal(found, sweep(frame)[torch.from_numpy((x > -3) & (x < 11))])
     for parts, why in (({}, "the log does not tell where its vehicle was"), ({"sweeps": None}, "no lidar is read")):
         assert ahead_only(recording(**parts), (-2, 80)).notes == (f"lidar_ahead=[-2, 80] has no effect: {why}",)

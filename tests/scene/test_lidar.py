@@ -4,7 +4,6 @@ import dataclasses
 import math
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -17,7 +16,6 @@ from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.scene.lidar import Rays, render_ranges
 from sparsestreet.scene.rendering import RenderOptions
 from sparsestreet.scene.standing import StandingScene
-from sparsestreet.types import Camera
 from tests.scene.street import background, keyframes, pose, random_rows, rigid, track
 
 OPTIONS = RenderOptions(SplatSettings(antialias=True), "cpu")

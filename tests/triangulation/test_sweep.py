@@ -219,6 +219,21 @@ def test_nothing_is_found_behind_a_mask(small, drive, name):
     assert 0.3 * len(small) < len(left) < 0.7 * len(small)
 
 
+def test_nothing_is_found_near_a_return(small, drive):
+    """A return, of any depth, at the first point that each view has: 0.005 of 160 columns around it, and no more."""
+    frames, near = [frame for frame, _ in drive], np.zeros(len(small), bool)
+    for place in np.unique(small.views):
+        own, depth = small.views == place, torch.zeros(HEIGHT, WIDTH)
+        column, row = small.pixels[own][0].astype(int)
+        depth[row, column] = 70.0
+        frames[place] = replace(frames[place], depth=depth)
+        near |= own & (np.abs(small.pixels.astype(int) - (column, row)) <= 1).all(1)
+    left = swept_points(as_frames(frames), [], SMALL)
+    assert near.sum() > len(np.unique(small.views))
+    np.testing.assert_array_equal(left.positions, small.positions[~near])
+    np.testing.assert_array_equal(left.views, small.views[~near])
+
+
 def test_nothing_is_found_through_a_moving_box(small, drive):
     """A box of the right wall at all frames but the last swept one, where it stands elsewhere."""
     frames = torch.arange(32)

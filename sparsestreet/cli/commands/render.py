@@ -247,6 +247,7 @@ def _render_sweeps(request: RenderRequest) -> None:
     from sparsestreet.cli.commands.scenes import open_scene, recorded_views, with_edits
     from sparsestreet.data.lidar_models import lidar_model
     from sparsestreet.export.sweeps import Instant, write_sweeps
+    from sparsestreet.scene.intensities import intensities_of
 
     started = time.perf_counter()
     model = lidar_model(request.lidar or "")
@@ -259,7 +260,8 @@ def _render_sweeps(request: RenderRequest) -> None:
         raise ValueError(f"{request.out.name} holds one sweep, and {len(instants)} are wanted: frames=0:1, or a folder")
     lidar = _mounted(request, model, views, path, log_fps)
     stored = with_edits(stored, views, request.edits)
-    print("intensities are 0: no scene has learned any")
+    if intensities_of(stored.scene) is None:
+        print("intensities are 0: the log of the scene has none, or it was trained before they were learned")
     ending = f".{request.format or SWEEPS[0]}"
     count = len(instants)
     points = write_sweeps(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
@@ -23,7 +23,7 @@ from sparsestreet.data.images import (
     read_transparent,
 )
 from sparsestreet.data.json_tree import unique
-from sparsestreet.data.lidar import check_points, empty_notes, returned
+from sparsestreet.data.lidar import check_points, empty_notes, returned, unit_intensities
 from sparsestreet.data.poses import AHEAD_FROM_OPENCV, check_rigid, recentered
 from sparsestreet.data.problems import LogError, Problem, fault, missing_files
 from sparsestreet.data.reader import LogFiles
@@ -300,11 +300,29 @@ def read_sweep(layout: Layout, frame: int, ahead: Sequence[float | int] | None =
 
     ``ahead``: of Waymo's points, which lie in the frame of the vehicle, only those with x between these numbers.
     """
-    points, rays = _read_rows(layout, frame)
-    points = points[returned(points) & returned(rays)]
+    points, some, _ = _returns(layout, frame, ahead)
+    return transform_points(read_pose(layout.sweep_pose(frame)), points[some])
+
+
+def read_intensities(layout: Layout, ahead: Sequence[float | int] | None, index: int) -> Float[Tensor, " n"] | None:
+    """Those of the points of ``read_points``; None: the flavor has none that is known."""
+    if layout.flavor.intensity is None:
+        return None
+    _, some, rows = _returns(layout, layout.frames[index], ahead)
+    # Waymo's are unbounded, few above 1; other data sets are converted as they were, from 0 to 1 or to 255.
+    brightest = 1.0 if layout.flavor.name == "waymo" else None
+    return unit_intensities(rows[:, layout.flavor.intensity], brightest)[some]
+
+
+def _returns(
+    layout: Layout, frame: int, ahead: Sequence[float | int] | None
+) -> tuple[Float64[Tensor, "m 3"], Bool[Tensor, " m"], np.ndarray]:
+    """Points as they are written, which of them count, and all numbers of their rows."""
+    points, rays, rows = _read_rows(layout, frame)
+    some = returned(points) & returned(rays)
     if ahead is not None and layout.flavor.name == "waymo":
-        points = points[(points[:, 0] > ahead[0]) & (points[:, 0] < ahead[1])]
-    return transform_points(read_pose(layout.sweep_pose(frame)), points)
+        some &= (points[:, 0] > ahead[0]) & (points[:, 0] < ahead[1])
+    return points, some, rows
 
 
 def sweep_origin(layout: Layout, origin: Float64[Tensor, "3"], index: int) -> Float64[Tensor, "3"] | None:
@@ -318,7 +336,7 @@ def sweep_origin(layout: Layout, origin: Float64[Tensor, "3"], index: int) -> Fl
         return None
     stood = torch.zeros(1, 3, dtype=torch.float64)
     if flavor == "waymo":
-        points, rays = _read_rows(layout, frame)
+        points, rays, _ = _read_rows(layout, frame)
         if not len(points):
             return None
         stood = (points - rays).median(dim=0).values[None]
@@ -331,8 +349,9 @@ def sweep_notes(layout: Layout) -> list[str]:
     return empty_notes(lambda path: _read_rows(layout, frames[path])[1], list(frames))
 
 
-def _read_rows(layout: Layout, frame: int) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"]]:
-    """Points as they are written, and seen from the sensor: in a Waymo row the ray's origin comes before its end."""
+def _read_rows(layout: Layout, frame: int) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, "n 3"], np.ndarray]:
+    """Points as they are written, and seen from the sensor: in a Waymo row the ray's origin comes before its end. Also
+    all numbers of the rows."""
     check_sweep_size(layout, frame)
     path = layout.sweep(frame)
     check_regular(path)
@@ -340,4 +359,5 @@ def _read_rows(layout: Layout, frame: int) -> tuple[Float64[Tensor, "n 3"], Floa
     first = layout.flavor.x_column
     points = torch.from_numpy(rows[:, first : first + 3].astype(np.float64))
     check_points(points, path, remedy=_REMEDY)
-    return points, points - torch.from_numpy(rows[:, :3].astype(np.float64)) if first else points
+    rays = points - torch.from_numpy(rows[:, :3].astype(np.float64)) if first else points
+    return points, rays, rows

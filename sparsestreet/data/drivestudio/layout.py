@@ -47,15 +47,17 @@ class Flavor:
     """float32 columns of a lidar row."""
     x_column: int = 0
     """Column of a point's x, before y and z (a Waymo row starts with the ray's origin)."""
+    intensity: int | None = None
+    """Column of a point's intensity; None: not known."""
 
 
 FLAVORS: dict[str, Flavor] = {
     flavor.name: flavor
     for flavor in (
-        Flavor(name="waymo", mounted=True, opencv=False, sweep_poses="ego_pose", columns=14, x_column=3),
-        Flavor(name="nuscenes", mounted=False, opencv=True, sweep_poses="lidar_pose", columns=4),
-        Flavor(name="kitti", mounted=True, opencv=True, sweep_poses="ego_pose", columns=4),
-        Flavor(name="argoverse", mounted=True, opencv=True, sweep_poses="ego_pose", columns=4),
+        Flavor(name="waymo", mounted=True, opencv=False, sweep_poses="ego_pose", columns=14, x_column=3, intensity=11),
+        Flavor(name="nuscenes", mounted=False, opencv=True, sweep_poses="lidar_pose", columns=4, intensity=3),
+        Flavor(name="kitti", mounted=True, opencv=True, sweep_poses="ego_pose", columns=4, intensity=3),
+        Flavor(name="argoverse", mounted=True, opencv=True, sweep_poses="ego_pose", columns=4, intensity=3),
         Flavor(name="nuplan", mounted=True, opencv=True, sweep_poses="ego_pose", columns=6),
         Flavor(name="pandaset", mounted=False, opencv=True, sweep_poses="ego_pose", columns=5),
     )

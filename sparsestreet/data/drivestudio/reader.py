@@ -20,6 +20,7 @@ from sparsestreet.data.drivestudio.contents import (
     read_clock,
     read_frame,
     read_instances,
+    read_intensities,
     read_intrinsics,
     read_points,
     read_pose,
@@ -180,6 +181,7 @@ class DriveStudioReader(LogReader):
             check=lambda: check_layout(layout, contents=True),
             tracks=tracks,
             origins=cache(partial(sweep_origin, layout, origin)),  # rows of Waymo are read for it
+            read_intensities=partial(read_intensities, layout, self.lidar_ahead),
         )
         return DrivingLog(
             name=layout.root.resolve().name,

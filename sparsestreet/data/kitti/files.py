@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import iterparse
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
-from sparsestreet.data.lidar import sensor_points
+from sparsestreet.data.lidar import sensor_returns
 from sparsestreet.data.poses import check_rigid
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import chosen_cameras, frame_window, listed
@@ -365,10 +365,21 @@ _MAX_SWEEP_BYTES = 1 << 24
 _REMEDY_SWEEP = "copy it again from the published archive, or remove it to read its frame without lidar"
 
 
+def read_returns(path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, " n"]]:
+    """Points (x forward, y left, z up) and reflectances, without the own car; LogError for a file that is no sweep."""
+    points, reflectances = sensor_returns(path, 4, 1.0, max_bytes=_MAX_SWEEP_BYTES, remedy=_REMEDY_SWEEP)
+    others = points.norm(dim=-1) >= OWN_CAR
+    return points[others], reflectances[others]
+
+
 def read_points(path: Path) -> Float64[Tensor, "n 3"]:
-    """x forward, y left, z up, without the returns of the own car; raises LogError for a file that is no sweep."""
-    points = sensor_points(path, 4, max_bytes=_MAX_SWEEP_BYTES, remedy=_REMEDY_SWEEP)
-    return points[points.norm(dim=-1) >= OWN_CAR]
+    """The points of ``read_returns``."""
+    return read_returns(path)[0]
+
+
+def read_intensities(path: Path) -> Float[Tensor, " n"]:
+    """The reflectances of ``read_returns``."""
+    return read_returns(path)[1]
 
 
 def point_stamps(points: Float64[Tensor, "n 3"], begin: int, end: int) -> Int64[Tensor, " n"]:

@@ -23,6 +23,7 @@ from sparsestreet.data.kitti.files import (
     point_stamps,
     read_calibration,
     read_clock,
+    read_intensities,
     read_lines,
     read_points,
     read_turns,
@@ -331,6 +332,7 @@ def _sweeps(drive: Drive, parts: _Parts) -> dict[int, LidarSweep]:
             partial(_read_sweep, drive, parts, place),
             parts.clock.stamps[place],
             (parts.poses[frame] @ parts.calibration.imu_from_lidar)[:3, 3],
+            partial(read_intensities, drive.sweep(frame)),
         )
         for place, frame in enumerate(drive.frames)
         if frame in parts.turns

@@ -17,6 +17,7 @@ from sparsestreet.data.kitti.files import (
     at_frames,
     increasing,
     point_stamps,
+    read_intensities,
     read_points,
     read_stamps,
 )
@@ -233,7 +234,12 @@ def _shots(sequence: SequenceFolders, parts: _Parts) -> list[RecordedImage]:
 def _sweeps(sequence: SequenceFolders, parts: _Parts) -> dict[int, LidarSweep]:
     poses = parts.path.at(torch.tensor(parts.stamps)) @ parts.calibration.imu_from_lidar
     return {
-        place: LidarSweep(partial(_read_sweep, sequence, parts, place), parts.stamps[place], poses[place, :3, 3])
+        place: LidarSweep(
+            partial(_read_sweep, sequence, parts, place),
+            parts.stamps[place],
+            poses[place, :3, 3],
+            partial(read_intensities, sequence.sweep(frame)),
+        )
         for place, frame in enumerate(parts.frames)
         if sequence.sweep(frame).is_file()
     }

@@ -11,10 +11,10 @@ from typing import ClassVar, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 from torch import Tensor
 
-from sparsestreet.data.lidar import sensor_points
+from sparsestreet.data.lidar import sensor_returns
 from sparsestreet.data.nuscenes.selection import Rate, Selection, select
 from sparsestreet.data.nuscenes.tables import LIDAR, DataFile, Row, SceneFiles, all_rows, pose_of, rows_of_tokens
 from sparsestreet.data.poses import check_extent
@@ -64,7 +64,7 @@ def _intrinsics(scene: SceneFiles, file: DataFile) -> Float64[np.ndarray, "3 3"]
 
 
 COLUMNS = 5
-"""float32: x, y, z in meters, intensity, ring."""
+"""float32: x, y, z in meters, intensity in [0, 255], ring."""
 _LARGEST = 100_000_000
 """Bytes; a genuine sweep of 35,000 returns has 0.7 MB."""
 OWN_CAR = 2.5
@@ -77,8 +77,18 @@ def read_sweep(path: Path, world_from_lidar: Float64[Tensor, "4 4"]) -> Float64[
 
     The publisher has moved them by the car's own motion to the sweep's stamp. Raises LogError for a broken file.
     """
-    points = sensor_points(path, COLUMNS, max_bytes=_LARGEST, remedy=_REMEDY)
-    return transform_points(world_from_lidar, points[points.norm(dim=1) >= OWN_CAR])
+    return transform_points(world_from_lidar, _street_returns(path)[0])
+
+
+def read_intensities(path: Path) -> Float[Tensor, " n"]:
+    """Those of the points of ``read_sweep``."""
+    return _street_returns(path)[1]
+
+
+def _street_returns(path: Path) -> tuple[Float64[Tensor, "n 3"], Float[Tensor, " n"]]:
+    points, intensities = sensor_returns(path, COLUMNS, 255.0, max_bytes=_LARGEST, remedy=_REMEDY)
+    others = points.norm(dim=1) >= OWN_CAR
+    return points[others], intensities[others]
 
 
 _LENGTH_WIDTH_HEIGHT = [1, 0, 2]
@@ -271,7 +281,12 @@ class NuScenesReader(RecordedReader):
             return None
         poses = {frame: chosen.world_from_sensor(file) for frame, file in chosen.sweeps.items()}
         return {
-            frame: LidarSweep(partial(read_sweep, file.path, poses[frame]), file.stamp, poses[frame][:3, 3])
+            frame: LidarSweep(
+                partial(read_sweep, file.path, poses[frame]),
+                file.stamp,
+                poses[frame][:3, 3],
+                partial(read_intensities, file.path),
+            )
             for frame, file in chosen.sweeps.items()
         }
 

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from sparsestreet.atomic import check_regular
 from sparsestreet.data.images import check_camera_images, check_image_sizes, read_mask
-from sparsestreet.data.lidar import check_points, empty_notes, returned
+from sparsestreet.data.lidar import check_points, empty_notes, returned, unit_intensities
 from sparsestreet.data.ply import read_ply
 from sparsestreet.data.poses import PosePath, check_extent, untwisted
 from sparsestreet.data.problems import (
@@ -40,7 +40,8 @@ from sparsestreet.data.rig_json.table import (
 from sparsestreet.geometry.cameras import transform_points
 from sparsestreet.types import Shutter
 
-_BIN = ("x", "y", "z", "intensity")
+_INTENSITY = "intensity"
+_BIN = ("x", "y", "z", _INTENSITY)
 _LONGEST_SWEEP = 1.0
 """Seconds around its stamp in which a point may have been measured."""
 
@@ -59,16 +60,8 @@ def read_sweep(
 
     Raises LogError for a file that is missing or holds anything else.
     """
-    points, times = read_rows(path, lidar.columns)
-    # Who writes the world's points moves a driver's zeros to the sensor, or leaves them.
-    some = returned(points)
-    points, times = points[some], None if times is None else times[some]
-    mount = lidar.vehicle_from_lidar
-    check_points(points - reference if mount is None else points, path)
-    center = reference if mount is None else torch.zeros(3, dtype=torch.float64)
-    far = ((points - center).norm(dim=-1) >= lidar.nearest) & returned(points - center)
-    points = points[far]
-    if mount is None:
+    points, times, _ = _returns(path, lidar, reference)
+    if (mount := lidar.vehicle_from_lidar) is None:
         return points
     points = transform_points(mount, points)
     stamp = frame.stamp if frame.sweep_stamp is None else frame.sweep_stamp
@@ -78,29 +71,59 @@ def read_sweep(
     try:
         if times is None:
             return transform_points(drive.at(torch.tensor([stamp]))[0], points)
-        return untwisted(points, stamp + (1e9 * times[far]).round().long(), drive)
+        return untwisted(points, stamp + (1e9 * times).round().long(), drive)
     except ValueError as error:
         raise fault(path, str(error), "leave out what was measured outside of the drive") from error
 
 
+def read_intensities(path: Path, lidar: LidarEntry, reference: Float64[Tensor, "3"]) -> Float[Tensor, " n"]:
+    """Those of the points of ``read_sweep``, of which each has one."""
+    _, _, intensities = _returns(path, lidar, reference)
+    assert intensities is not None  # the reader has looked
+    return intensities
+
+
+def has_intensities(path: Path, columns: tuple[str, ...] | None) -> bool:
+    """Whether the rows of a sweep have a column of that name."""
+    return path.suffix != ".ply" and _INTENSITY in (columns or (_BIN if path.suffix == ".bin" else ()))
+
+
+def _returns(
+    path: Path, lidar: LidarEntry, reference: Float64[Tensor, "3"]
+) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, " n"] | None, Float[Tensor, " n"] | None]:
+    """The points that are returns from the street, as they are written, with times and intensities."""
+    rows = read_rows(path, lidar.columns)
+    # Who writes the world's points moves a driver's zeros to the sensor, or leaves them.
+    some = returned(rows[0])
+    mount = lidar.vehicle_from_lidar
+    check_points((rows[0] - reference if mount is None else rows[0])[some], path)
+    away = rows[0] - (reference if mount is None else 0.0)
+    some &= (away.norm(dim=-1) >= lidar.nearest) & returned(away)
+    points, times, intensities = (None if one is None else one[some] for one in rows)
+    assert points is not None
+    return points, times, intensities
+
+
 def read_rows(
     path: Path, columns: tuple[str, ...] | None
-) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, " n"] | None]:
-    """Points as they are written, and their seconds behind the stamp of the sweep where ``columns`` have a time."""
+) -> tuple[Float64[Tensor, "n 3"], Float64[Tensor, " n"] | None, Float[Tensor, " n"] | None]:
+    """Points as they are written, their seconds behind the stamp of the sweep and their intensities, where ``columns``
+    have a time or an intensity."""
     if path.suffix == ".ply":
-        return read_ply(path)[0], None
+        return read_ply(path)[0], None, None
     if path.suffix not in (".bin", ".npy"):
         raise fault(path, f"points of the ending {path.suffix!r} are not read", "write .bin, .npy or .ply")
     rows = _binary(path, columns or _BIN) if path.suffix == ".bin" else _array(path, columns)
-    names = columns or _BIN[:3]
+    names = columns or (_BIN if path.suffix == ".bin" else _BIN[:3])
+    intensities = unit_intensities(rows[:, names.index(_INTENSITY)], None) if _INTENSITY in names else None
     points = np.stack([rows[:, names.index(axis)] for axis in "xyz"], 1).astype(np.float64)
     if "time" not in names:
-        return torch.from_numpy(points), None
+        return torch.from_numpy(points), None, intensities
     times = torch.from_numpy(rows[:, names.index("time")].astype(np.float64))
     if not (times.abs() <= _LONGEST_SWEEP).all():
         message = f"times must lie within {_LONGEST_SWEEP:g} s of the sweep's stamp"
         raise fault(path, message, "write seconds behind the stamp")
-    return torch.from_numpy(points), times
+    return torch.from_numpy(points), times, intensities
 
 
 def _binary(path: Path, columns: tuple[str, ...]) -> np.ndarray:
@@ -175,7 +198,9 @@ class Part:
                 reference = near[index] if frame.world_from_vehicle is None else frame.world_from_vehicle[:3, 3]
                 read = partial(read_sweep, frame.sweep, frame, self.table.lidar, drive, reference)
                 stood = _stood(frame, self.table.lidar.vehicle_from_lidar, stamp, drive)
-                sweeps[index] = LidarSweep(read, stamp, stood)
+                has = has_intensities(frame.sweep, self.table.lidar.columns)
+                intensities = partial(read_intensities, frame.sweep, self.table.lidar, reference) if has else None
+                sweeps[index] = LidarSweep(read, stamp, stood, intensities)
         return sweeps
 
     def boxes(self) -> list[Boxes] | None:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from PIL import Image
 from torch import Tensor
 
 from sparsestreet.data.images import GivenMasks, colors
-from sparsestreet.data.lidar import check_points
+from sparsestreet.data.lidar import check_points, unit_intensities
 from sparsestreet.data.poses import PosePath, check_extent
 from sparsestreet.data.problems import LogError, Problem, attempt, fault
 from sparsestreet.data.reader import FolderSignature, LogFiles, chosen_cameras, frame_window, listed
@@ -332,6 +332,7 @@ class WaymoReader(RecordedReader):
                 partial(_read_points, segment, spool, frame),
                 _instant(segment, frame),
                 None if top is None else (segment.world_from_vehicle(frame) @ top.vehicle_from_lidar)[:3, 3],
+                partial(_read_intensities, segment, spool, frame),
             )
             for index, frame in enumerate(frames)
             if segment.has_returns(frame)
@@ -396,18 +397,27 @@ def _read_masks(
 
 
 def _read_points(segment: Segment, spool: Spool, frame: int) -> Float64[Tensor, "n 3"]:
-    """Points of the world, decoded once: they are kept as float32 from where the vehicle was, exact to 0.01 mm."""
-    pose = segment.world_from_vehicle(frame)
+    """Points of the world."""
+    near = _read_rows(segment, spool, frame)[:, :3]
+    return torch.from_numpy(near.astype(np.float64)) + segment.world_from_vehicle(frame)[:3, 3]
+
+
+def _read_intensities(segment: Segment, spool: Spool, frame: int) -> Float[Tensor, " n"]:
+    return unit_intensities(_read_rows(segment, spool, frame)[:, 3], brightest=1.0)
+
+
+def _read_rows(segment: Segment, spool: Spool, frame: int) -> Float32[np.ndarray, "n 4"]:
+    """Points from where the vehicle was, as float32 exact to 0.01 mm, and intensities; decoded once."""
     if frame not in spool:
-        parts = [np.zeros((0, 3))]
+        pose, parts = segment.world_from_vehicle(frame), [np.zeros((0, 4))]
         for returns in segment.returns(frame):
             calibration = check_returns(returns, segment.lidars.get(returns.lidar), segment.lidar_file, frame)
-            parts.append(world_points(returns, calibration, pose))
-        near = torch.from_numpy(np.concatenate(parts)) - pose[:3, 3]
-        check_points(near, segment.lidar_file, remedy=REMEDY)
-        spool.put(frame, near.float().numpy().tobytes())
-    near = np.frombuffer(spool.get(frame), np.float32).reshape(-1, 3)
-    return torch.from_numpy(near.astype(np.float64)) + pose[:3, 3]
+            points, intensities = world_points(returns, calibration, pose)
+            parts.append(np.column_stack((points - pose[:3, 3].numpy(), intensities)))
+        rows = np.concatenate(parts)
+        check_points(torch.from_numpy(rows[:, :3]), segment.lidar_file, remedy=REMEDY)
+        spool.put(frame, rows.astype(np.float32).tobytes())
+    return np.frombuffer(spool.get(frame), np.float32).reshape(-1, 4)
 
 
 def _once(problems: Sequence[Problem]) -> list[Problem]:

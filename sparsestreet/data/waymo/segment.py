@@ -100,6 +100,8 @@ class Returns:
     """row * columns + column of each."""
     ranges: Float[np.ndarray, " n"]
     """Meters."""
+    intensities: Float[np.ndarray, " n"]
+    """Unbounded; few are above 1."""
     poses: Float[np.ndarray, "h w 6"] | None = None
     """Of the lidar TOP: roll, pitch, yaw, x, y, z of the vehicle in the world at each pixel's own instant."""
 
@@ -278,15 +280,18 @@ SPIN = 100_000_000
 def returns_of(
     lidar: str, images: list[Float[np.ndarray, "_ _ c"]], poses: Float[np.ndarray, "_ _ 6"] | None
 ) -> Returns:
-    """What came back, of the range images of the first and the second return; range is their first channel."""
-    pixels, ranges = [], []
+    """What came back, of the range images of the first and the second return, whose channels begin with range and
+    intensity."""
+    pixels, ranges, intensities = [], [], []
     for image in images:
         values = image[..., 0].ravel()
         some = np.flatnonzero(values > 0)
         pixels.append(some)
         ranges.append(values[some])
+        intensities.append(image[..., 1].ravel()[some])
     height, width = images[0].shape[:2]
-    return Returns(lidar, (height, width), np.concatenate(pixels), np.concatenate(ranges), poses)
+    numbers = np.concatenate(ranges), np.concatenate(intensities)
+    return Returns(lidar, (height, width), np.concatenate(pixels), numbers[0], numbers[1], poses)
 
 
 def check_returns(returns: Returns, lidar: LidarCalibration | None, path: Path, frame: int) -> LidarCalibration:
@@ -310,8 +315,8 @@ def check_returns(returns: Returns, lidar: LidarCalibration | None, path: Path, 
 
 def world_points(
     returns: Returns, lidar: LidarCalibration, world_from_vehicle: Float64[Tensor, "4 4"]
-) -> Float64[np.ndarray, "n 3"]:
-    """Where the rays ended, in the world.
+) -> tuple[Float64[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Where the rays ended, in the world, and the intensity of what came back.
 
     Returns of TOP lie where they were measured, each by the pose of its pixel; those without a pose (all zeros) are
     left out. The files have the points of the other lidars at the pose of the frame, ``world_from_vehicle``.
@@ -322,10 +327,10 @@ def world_points(
     in_vehicle = in_sensor @ mount[:3, :3].T + mount[:3, 3]
     if returns.poses is None:
         pose = world_from_vehicle.numpy()
-        return in_vehicle @ pose[:3, :3].T + pose[:3, 3]
+        return in_vehicle @ pose[:3, :3].T + pose[:3, 3], returns.intensities
     poses = returns.poses.reshape(-1, 6)[returns.pixels].astype(np.float64)
     posed = poses.any(1)
-    return _turned(poses[posed, :3], in_vehicle[posed]) + poses[posed, 3:]
+    return _turned(poses[posed, :3], in_vehicle[posed]) + poses[posed, 3:], returns.intensities[posed]
 
 
 def crossing(x: float, y: float) -> int:

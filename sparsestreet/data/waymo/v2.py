@@ -301,7 +301,8 @@ def pack_returns(cells: list[Any], path: Path) -> bytes:
         return b""
     returns = returns_of("", images, None)
     head = np.array([*returns.shape, len(returns.pixels)], "<i8")
-    return head.tobytes() + returns.pixels.astype("<i4").tobytes() + returns.ranges.astype("<f4").tobytes()
+    numbers = (returns.ranges.astype("<f4").tobytes(), returns.intensities.astype("<f4").tobytes())
+    return b"".join((head.tobytes(), returns.pixels.astype("<i4").tobytes(), *numbers))
 
 
 def pack_poses(cells: list[Any], path: Path) -> bytes:
@@ -315,15 +316,16 @@ def pack_poses(cells: list[Any], path: Path) -> bytes:
 def unpack(lidar: str, packed: bytes, poses: bytes | None) -> Returns:
     """The returns, with the poses of the pixels."""
     if not packed:
-        return Returns(lidar, (1, 1), np.zeros(0, np.int64), np.zeros(0, np.float32))
+        return Returns(lidar, (1, 1), np.zeros(0, np.int64), *np.zeros((2, 0), np.float32))
     height, width, count = np.frombuffer(packed, "<i8", 3).tolist()
     pixels = np.frombuffer(packed, "<i4", count, 24).astype(np.int64)
     ranges = np.frombuffer(packed, "<f4", count, 24 + 4 * count)
+    intensities = np.frombuffer(packed, "<f4", count, 24 + 8 * count)
     matrix = None
     if poses is not None:
         rows, columns = np.frombuffer(poses, "<i8", 2).tolist()
         matrix = np.frombuffer(poses, "<f4", offset=16).reshape(rows, columns, 6)
-    return Returns(lidar, (height, width), pixels, ranges, matrix)
+    return Returns(lidar, (height, width), pixels, ranges, intensities, matrix)
 
 
 VEHICLE_POSE = "world_from_vehicle.transform"

@@ -15,7 +15,7 @@ from sparsestreet.geometry.boxes import displacement
 from sparsestreet.ops.activate import activate
 from sparsestreet.ops.raw import RawGaussians
 from sparsestreet.scene.density import DensityStrategy
-from sparsestreet.scene.gaussians import Rows, drop_parameter
+from sparsestreet.scene.gaussians import INTENSITIES, Rows, drop_parameter
 from sparsestreet.scene.initialize.gaussians import Points, init_gaussians
 from sparsestreet.scene.initialize.training_data import TrainingData
 from sparsestreet.scene.learning_rate import Rates, rates_of, usual_rates
@@ -400,9 +400,10 @@ class Node(nn.Module, ABC):
             self.rows.register_buffer(name, values)
 
     def row_bytes(self) -> int:
-        """Return the float32 bytes of the rows without their masks; an instance id is one number, bits are packed."""
+        """Return the float32 bytes of the rows without their masks, and without intensities, which no image needs; an
+        instance id is one number, bits are packed."""
         columns = self.rows.columns()
-        return sum(_bytes(columns[name]) for name in columns.keys() - self.rows.transient)
+        return sum(_bytes(columns[name]) for name in columns.keys() - self.rows.transient - {INTENSITIES})
 
     def _load_from_state_dict(self, state_dict, prefix, *args) -> None:
         """Finishes the mask first if the checkpoint lacks the mask's columns, because it is from after the mask stage.

@@ -22,7 +22,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch import Tensor
 
 from sparsestreet.atomic import atomic_file, check_regular
-from sparsestreet.data.lazy import Sweeps
+from sparsestreet.data.lazy import Sweeps, spread
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.evaluation.speed import device_name
 from sparsestreet.naming import kept_before
@@ -33,6 +33,7 @@ from sparsestreet.records.curves import CountChange
 from sparsestreet.records.run import RIG, RUN, Matrix, RigRecord, RunDescription
 from sparsestreet.scene import views
 from sparsestreet.scene.gaussians import RowPlan
+from sparsestreet.scene.intensities import learn_intensities
 from sparsestreet.scene.storage import SCENE_FILE, StoredScene, save_scene
 from sparsestreet.training.callbacks.density_control import RowListener
 from sparsestreet.training.callbacks.times import Clock
@@ -284,6 +285,8 @@ class RunFiles(Callback, RowListener):
 
     def on_train_end(self, trainer: Trainer, pl_module: StreetSystem) -> None:
         if not trainer.interrupted:
+            with stage("intensities"):
+                _learn_intensities(trainer, pl_module)
             self.write(trainer, pl_module)
 
     def on_exception(self, trainer: Trainer, pl_module: StreetSystem, exception: BaseException) -> None:
@@ -325,6 +328,27 @@ class RunFiles(Callback, RowListener):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.caps = dict(state_dict["caps"])
+
+
+MAX_SWEEPS = 60
+"""Of whose returns intensities are learned, spread over the log; on a processor each takes a tenth of a second."""
+
+
+def _learn_intensities(trainer: Trainer, system: StreetSystem) -> None:
+    """Where the log has any: of sweeps that no instant held out has."""
+    if not trainer.is_global_zero:
+        return
+    data = data_of(trainer)
+    held_out, sweeps = data.split.held_out_indices, data.driving_log.sweeps
+    known = [place for place, index in enumerate(sweeps.indices) if index not in held_out]
+    sweeps = sweeps.at(known[at] for at in spread(len(known), MAX_SWEEPS))
+    returns = (
+        (sweep, values)
+        for sweep in sweeps.gray()
+        if sweep.origin is not None and (values := sweeps.load_intensities(sweep.index)) is not None
+    )
+    if met := learn_intensities(system.scene, returns, system.options):
+        log.info("intensities: returns met %d of %d Gaussians", met, sum(system.scene.counts().values()))
 
 
 def _rig(log: DrivingLog) -> RigRecord:

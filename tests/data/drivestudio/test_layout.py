@@ -229,6 +229,30 @@ def test_returns_ahead_of_the_vehicle(tmp_path):
         assert "lidar_ahead" not in " ".join(quiet.read().notes)
 
 
+@pytest.mark.parametrize(
+    ("make", "column", "brightest"), [(make_waymo, 11, 1.0), (make_nuscenes, 3, 255.0), (make_nuscenes, 3, 1.0)]
+)
+def test_intensities_are_those_of_the_points(tmp_path, make, column, brightest):
+    """From 0 to 1 as they are, from 0 to 255 divided; the second row is no return, what is no number counts as 0."""
+    root = make(tmp_path)
+    path = root / "lidar/001.bin"
+    rows = np.fromfile(path, "<f4").reshape(len(POINTS_IN_WORLD), -1)
+    first = 0 if column == 3 else 3
+    rows[1, first : first + 3] = rows[1, :3] = 0
+    rows[:, column] = brightest * np.array([0.2, 0.4, 1.0, np.nan, 0.8], np.float32)
+    rows.tofile(path)
+    sweeps = DriveStudioReader(root).read().sweeps
+    assert len(sweeps[1].points) == 4
+    np.testing.assert_allclose(sweeps.load_intensities(1), [0.2, 1.0, 0.0, 0.8], atol=1e-6)
+    if make is make_waymo:
+        ahead = DriveStudioReader(root, lidar_ahead=(-6.5, 8.0)).read().sweeps
+        np.testing.assert_allclose(ahead.load_intensities(1), [1.0, 0.0], atol=1e-6)
+
+
+def test_a_flavor_of_unknown_columns_has_no_intensities(tmp_path):
+    assert DriveStudioReader(make_pandaset(tmp_path)).read().sweeps.load_intensities(1) is None
+
+
 def test_the_axes_of_the_first_pose(tmp_path):
     """The vehicle's of Waymo, the front camera's of nuScenes."""
     flavors = ((make_waymo, TURN_LEFT), (make_nuscenes, WORLD_FROM_OPENCV))

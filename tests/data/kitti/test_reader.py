@@ -12,7 +12,7 @@ from sparsestreet.data.kitti.files import point_stamps, read_stamps
 from sparsestreet.data.log import DrivingLog
 from sparsestreet.data.recording import Recording
 from tests.data.kitti.write import CAMERAS, DRIVE, lidar_from_camera, write_kitti
-from tests.data.plan import Plan, moved, pose, turned
+from tests.data.plan import Plan, levels, moved, pose, turned
 from tests.shared import made_once
 
 PLAN = Plan()
@@ -72,6 +72,11 @@ def test_the_vehicle_is_the_imu(recording, shift):
         wanted[:3, 3] += shift
         assert np.abs(found[:3, :3] - wanted[:3, :3]).max() < 1e-9
         assert np.abs(found[:3, 3] - wanted[:3, 3]).max() < 3
+
+
+def test_each_point_has_its_reflectance(recording):
+    for frame, sweep in recording.sweeps.items():
+        np.testing.assert_allclose(sweep.intensities(), levels(len(PLAN.world_points(frame))), atol=1e-6)
 
 
 def test_points_are_where_the_street_was(recording, shift):

@@ -8,7 +8,7 @@ from PIL import Image
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
-from tests.data.plan import Plan, pose, turned
+from tests.data.plan import Plan, levels, pose, turned
 
 DATE = "2011_09_26"
 DRIVE = f"{DATE}_drive_0099"
@@ -94,7 +94,7 @@ def write_lidar(folder: Path, plan: Plan) -> None:
     folder.mkdir(parents=True)
     for frame in range(plan.num_frames):
         points = np.concatenate([OWN_CAR, plan.sweep(frame)[0]])
-        rows = np.column_stack([points, np.full(len(points), 0.5)])
+        rows = np.column_stack([points, [*[0.5] * len(OWN_CAR), *levels(len(points) - len(OWN_CAR))]])
         rows.astype("<f4").tofile(folder / f"{frame:010d}.bin")
 
 

@@ -24,7 +24,7 @@ from tests.data.kitti360.write import (
     write_fisheye,
     write_kitti360,
 )
-from tests.data.plan import moved
+from tests.data.plan import levels, moved
 from tests.shared import made_once
 
 FRAMES = [frame for frame in range(PLAN.num_frames) if frame != UNPOSED]
@@ -74,6 +74,7 @@ def test_points_are_where_the_street_was(recording):
         alone = frame in (0, UNPOSED - 1, UNPOSED + 1, PLAN.num_frames - 1)
         bound = 0.5 * 0.5 * (1.5 if alone else 0.5) * curvature
         assert np.linalg.norm(points - wanted, axis=1).max() < bound + 2e-5
+        np.testing.assert_allclose(sweep.intensities(), levels(len(wanted)), atol=1e-6)
         still = moved(PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar, PLAN.sweep(frame)[0])
         assert np.abs(still - wanted).max() > 0.4
         stood = PLAN.world_from_vehicle(int(PLAN.stamps[frame])) @ PLAN.vehicle_from_lidar

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from tests.data.kitti.write import OWN_CAR, numbers, rectifying, write_images, write_stamps
-from tests.data.plan import Plan, pose, turned
+from tests.data.plan import Plan, levels, pose, turned
 
 SEQUENCE = "2013_05_28_drive_0003_sync"
 PLAN = Plan(num_frames=6)
@@ -31,7 +31,8 @@ def write_kitti360(root: Path, plan: Plan = PLAN) -> Path:
     lidar.mkdir(parents=True)
     for frame in range(plan.num_frames):
         points = np.concatenate([OWN_CAR, plan.sweep(frame)[0]])
-        np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(lidar / f"{frame:010d}.bin")
+        reflectances = [*[0.5] * len(OWN_CAR), *levels(len(points) - len(OWN_CAR))]
+        np.column_stack([points, reflectances]).astype("<f4").tofile(lidar / f"{frame:010d}.bin")
     write_poses(root / "data_poses" / SEQUENCE / "poses.txt", plan)
     write_boxes(root / "data_3d_bboxes" / "train" / f"{SEQUENCE}.xml", plan)
     write_labels(root / "data_2d_semantics" / "train" / SEQUENCE / "image_00" / "semantic", plan)

@@ -8,7 +8,7 @@ from PIL import Image
 from sparsestreet.data.nuscenes import NuScenesReader
 from sparsestreet.data.recording import Recording
 from tests.data.nuscenes.written import CHANNELS, Written, sweep_end, token, write_nuscenes
-from tests.data.plan import Plan
+from tests.data.plan import Plan, levels
 from tests.typed import there
 
 PLAN = Plan()
@@ -74,6 +74,7 @@ def test_returns_are_where_they_were_and_the_own_car_has_none(recording):
         points = sweep.read()
         # One return of the roof was written too. float32 has steps of 4e-6 m at 45 m.
         assert np.allclose(points, PLAN.world_points(frame), rtol=0, atol=1e-5)
+        np.testing.assert_allclose(sweep.intensities(), levels(len(points)), atol=1e-6)
         stood = PLAN.world_from_vehicle(sweep_end(PLAN, frame)) @ PLAN.vehicle_from_lidar
         assert np.allclose(there(sweep.origin), stood[:3, 3], rtol=0, atol=1e-6)
 

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from sparsestreet.geometry import quaternions as quat
-from tests.data.plan import Plan, moved
+from tests.data.plan import Plan, levels, moved
 
 TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample", "sample_annotation",
@@ -144,7 +144,8 @@ def _write_file(root: Path, plan: Plan, channel: str, frame: int, folder: str) -
     path.parent.mkdir(parents=True, exist_ok=True)
     if camera is None:
         points = sensor_points(plan, frame)
-        np.concatenate((points, np.full((len(points), 2), 7)), 1).astype("<f4").tofile(path)
+        intensities = [*(255 * levels(len(points) - 1)), 7]
+        np.column_stack((points, intensities, np.full(len(points), 7))).astype("<f4").tofile(path)
         return {"timestamp": stamp // 1000, "fileformat": "pcd", "height": 0, "width": 0, "filename": name}
     Image.fromarray(plan.image(frame, camera)).save(path, quality=98, subsampling=0)
     size = {"height": camera.height, "width": camera.width}

@@ -153,7 +153,7 @@ def test_mutated_arrays_are_read_or_refused(root, tmp_path):
             content[place] = random.integers(256)
         path.write_bytes(content)
         try:
-            points, _ = read_rows(path, ("time", "x", "y", "z"))
+            points, _, _ = read_rows(path, ("time", "x", "y", "z"))
             assert points.shape[1] == 3
         except LogError:
             refused += 1

@@ -19,7 +19,7 @@ from sparsestreet.data.problems import LogError
 from sparsestreet.data.recording import Recording
 from sparsestreet.data.rig_json import RigJsonReader
 from sparsestreet.data.rig_json.table import LENSES
-from tests.data.plan import Plan, moved
+from tests.data.plan import Plan, levels, moved
 from tests.data.rig_json.write import in_lidar, write_json
 from tests.typed import there
 
@@ -159,7 +159,7 @@ def test_points_in_other_files(written):
     folder, content = written
     content["lidar"] = {"vehicle_from_lidar": PLAN.vehicle_from_lidar.tolist(), "nearest": 10.0}
     points = in_lidar(PLAN, 0)
-    np.column_stack((points, np.zeros(len(points)))).astype("<f4").tofile(folder / "lidar/000.bin")
+    np.column_stack((points, 255 * levels(len(points)))).astype("<f4").tofile(folder / "lidar/000.bin")
     content["frames"][0]["lidar"] = {"file": "lidar/000.bin"}
     for frame in content["frames"][1:]:
         del frame["lidar"]
@@ -168,6 +168,7 @@ def test_points_in_other_files(written):
     far = np.linalg.norm(points, axis=1) >= 10
     assert 0 < far.sum() < len(far)
     np.testing.assert_allclose(sweeps[0].read().numpy(), PLAN.world_points(0)[far], atol=1e-5)  # float32 of 45 m
+    np.testing.assert_allclose(there(sweeps[0].intensities)(), levels(len(points))[far], atol=1e-6)
     assert list(sweeps) == [0]
 
     rows = np.empty(len(points), dtype=[(axis, "f8") for axis in "xyz"])

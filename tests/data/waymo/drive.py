@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from tests.data.plan import PER_SECOND, Plan, PlannedCamera, moved, pose, turned
+from tests.data.plan import PER_SECOND, Plan, PlannedCamera, levels, moved, pose, turned
 
 OPENCV = pose(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (0, 0, 0))
 """Waymo's camera axes (x forward, y left, z up) from OpenCV's."""
@@ -125,7 +125,7 @@ class Drive(Plan):
     def top(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Range images of both returns (range, intensity, elongation, no label zone) and the poses of the pixels."""
         first = np.zeros((self.beams, self.columns, 4), np.float32)
-        first[..., 0], first[..., 1] = self.ranges(frame), 0.5
+        first[..., 0], first[..., 1] = self.ranges(frame), levels(self.beams * self.columns).reshape(first.shape[:2])
         first[first[..., 0] == 0] = -1
         second = np.full_like(first, -1)
         second[0, ::7, 0] = np.where(first[0, ::7, 0] > 0, first[0, ::7, 0] + 2, -1)
@@ -135,6 +135,11 @@ class Drive(Plan):
         matrix = np.repeat(np.stack(angles, -1)[None], self.beams, 0)
         matrix[first[..., 0] <= 0] = 0
         return first, second, matrix.astype(np.float32)
+
+    def intensities(self, frame: int) -> np.ndarray:
+        """Of all returns, in [0, 1]: those of second returns are not known, and those of FRONT lie above."""
+        images = (*self.top(frame)[:2], self.ahead(frame))
+        return np.concatenate([image[..., 1][image[..., 0] > 0] for image in images]).clip(0, 1)
 
     def ahead(self, frame: int) -> np.ndarray:
         """Range image of the lidar FRONT, whose inclinations are spread evenly."""

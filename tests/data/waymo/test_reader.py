@@ -88,6 +88,7 @@ def test_points_come_back_to_a_millimeter(root, drive):
         assert sweep.stamp == drive.stamps[frame]
         # float32 poses of a world 4 km away are rounded to 0.24 mm an axis.
         np.testing.assert_allclose(points, drive.points(frame), rtol=0, atol=1e-3)
+        np.testing.assert_allclose(there(sweep.intensities)(), drive.intensities(frame), atol=1e-6)
         stood = (drive.world_from_vehicle(drive.stamps[frame]) @ drive.vehicle_from_lidar)[:3, 3]
         np.testing.assert_allclose(there(sweep.origin).numpy(), stood, rtol=0, atol=1e-3)
 
