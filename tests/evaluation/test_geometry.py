@@ -16,6 +16,7 @@ from sparsestreet.evaluation.geometry import measure_geometry, range_errors
 from sparsestreet.records.geometry import Geometry, RangeErrors
 from sparsestreet.records.summary import HELD_OUT, SUMMARY, TRAINING
 from sparsestreet.report.result import result_lines
+from sparsestreet.scene.gaussians import INTENSITIES
 from sparsestreet.scene.graph import SceneGraph
 from sparsestreet.types import Sweep, Track
 from tests.evaluation.dark import evaluate, make_frames
@@ -95,6 +96,24 @@ def test_errors_of_five_rays():
     assert found.all.median == pytest.approx(0.325, abs=1e-3)
     assert (found.split, found.sweeps, found.strides) == (HELD_OUT, (5,), (1,))
     assert found == measured(sweep())  # to the last bit
+
+
+def test_intensities_count_where_the_range_is_right():
+    """Of the rays within 0.2 m, the first and the third: 0.6 and 0.2 were recorded, each Gaussian has 0.5."""
+    scene, log = balls(), log_of(sweep())
+    values = torch.tensor([0.6, 1.0, 0.2, 1.0, 1.0])
+    sweeps = Sweeps(log.sweeps.indices, log.sweeps.load, load_intensities=lambda index: values)
+    log = dataclasses.replace(log, sweeps=sweeps)
+    without = measure_geometry(scene, log, frozenset({5}), OPTIONS)
+    assert without is not None
+    assert (without.intensity_error, without.intensity_spread) == (None, None)
+    rows = scene.nodes["road"].rows
+    rows.register_buffer(INTENSITIES, torch.full((len(rows),), 127, dtype=torch.uint8))
+    found = measure_geometry(scene, log, frozenset({5}), OPTIONS)
+    assert found is not None
+    assert found.intensity_error == pytest.approx((0.6 - 127 / 255 + 127 / 255 - 0.2) / 2, abs=1e-6)
+    assert found.intensity_spread == pytest.approx(0.2, abs=1e-6)  # around their median, 0.4
+    assert found.groups == without.groups
 
 
 def test_a_group_of_which_nothing_is_met_has_no_error():

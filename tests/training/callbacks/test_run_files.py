@@ -56,6 +56,22 @@ def trainer(tmp_path) -> StubTrainer:
     return trainer
 
 
+def test_intensities_are_learned_of_no_sweep_that_is_held_out(trainer):
+    """Of sweeps 1, 2 and 4; an interrupted training learns none."""
+    log, asked = trainer.datamodule.driving_log, []
+
+    def intensities(index: int) -> torch.Tensor:
+        asked.append(index)
+        return torch.ones(1)
+
+    sweeps = Sweeps(log.sweeps.indices, log.sweeps.load, load_intensities=intensities)
+    trainer.datamodule = StreetData(replace(log, sweeps=sweeps), stride=3, offset=1)
+    for trainer.interrupted in (True, False):
+        assert asked == []
+        trainer.callbacks[0].on_train_end(trainer, trainer.system)
+    assert asked == [2]
+
+
 def files(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
