@@ -88,6 +88,9 @@ def _ranges(geometry: Geometry | None) -> list[str]:
     if geometry is None or not said:
         return []
     sweeps = f"{len(geometry.sweeps)} {geometry.split.replace('_', '-')} sweeps"
+    error, spread = geometry.intensity_error, geometry.intensity_spread
+    if error is not None and spread is not None:
+        said.append(f"intensities {error:.3f} off ({spread:.3f} if all were the same)")
     return [f"ranges along the rays of {sweeps}: median error {', '.join(said)}"]
 
 

@@ -26,7 +26,7 @@ _APART = 1e4
 
 @torch.no_grad()
 def learn_intensities(
-    scene: SceneGraph, returns: Iterable[tuple[Sweep, Float[Tensor, "_"]]], options: RenderOptions
+    scene: SceneGraph, returns: Iterable[tuple[Sweep, Float[Tensor, " _"]]], options: RenderOptions
 ) -> int:
     """Write the column ``intensities`` of every node, and return how many rows some return met.
 

@@ -62,15 +62,15 @@ def street_points(frames: Frames, moving: Sequence[Track], settings: ImagePointS
     log.info("points from %d images: %d that stand still, %d in boxes", len(frames), len(found), carried)
     if settings.sweep is None:
         return StreetPoints(found, in_boxes)
-    far = swept_points(frames, moving, settings.sweep, settings.workers)
+    far = swept_points(frames, moving, settings.sweep, settings.workers, partial(_report, what="views swept"))
     starts = TriangulatedPoints.concatenate((found, thinned(far, settings.sweep.spacing)))
     return StreetPoints(starts, in_boxes, far)
 
 
-def _report(done: int, total: int) -> None:
-    """Log a line whenever another quarter of the pairs is compared."""
+def _report(done: int, total: int, what: str = "pairs compared") -> None:
+    """Log a line whenever another quarter is done."""
     if done * 4 // total > (done - 1) * 4 // total:
-        log.info("points from images: %d of %d pairs compared", done, total)
+        log.info("points from images: %d of %d %s", done, total, what)
 
 
 def _sightings(frames: Frames, settings: ImagePointSettings) -> list[Sighting]:

@@ -5,7 +5,7 @@ a street as in Gallup et al. 2007). A point counts where two neighboring swept v
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -66,7 +66,11 @@ class _Image:
 
 
 def swept_points(
-    frames: Frames, moving: Sequence[Track], settings: SweepSettings, threads: int = 1
+    frames: Frames,
+    moving: Sequence[Track],
+    settings: SweepSettings,
+    threads: int = 1,
+    report: Callable[[int, int], None] = lambda done, total: None,
 ) -> TriangulatedPoints:
     """Return the far points on which swept views agree; none if no camera looks along its way.
 
@@ -78,6 +82,7 @@ def swept_points(
         moving: objects that move on their own; nothing is found through their boxes.
         settings: limits of the search.
         threads: that work at once; each needs about 2.6 kB a pixel of the compared images.
+        report: is told how many of how many views are swept.
     """
     plan = partners(frames.views, settings.step)
     needed = sorted({place for first, others in plan.items() for place in (first, *others)})
@@ -88,9 +93,12 @@ def swept_points(
     with ThreadPoolExecutor(threads) as executor:
         read = executor.map(lambda place: _image(frames[place], settings.width), needed)
         images = dict(zip(needed, read, strict=True))
-        depths = dict(zip(plan, executor.map(depth, plan), strict=True))
-    found = [_points(images[place], place, _agreed(place, images, depths), moving) for place in plan]
-    points = TriangulatedPoints.concatenate([_NOTHING, *found])
+        depths = {}
+        for place, found in zip(plan, executor.map(depth, plan), strict=True):
+            depths[place] = found
+            report(len(depths), len(plan))
+    parts = [_points(images[place], place, _agreed(place, images, depths), moving) for place in plan]
+    points = TriangulatedPoints.concatenate([_NOTHING, *parts])
     log.info("points far ahead from %d of %d images: %d", len(plan), len(frames), len(points))
     return points
 

@@ -12,6 +12,7 @@ from sparsestreet.records.run import EffectDecision
 from sparsestreet.records.summary import HELD_OUT, MetricSummary
 from sparsestreet.report.result import result_lines
 from tests.evaluation.frames import disturbed, make_summary, with_ranges
+from tests.typed import there
 
 
 def test_what_a_run_came_to():
@@ -33,6 +34,10 @@ def test_ranges_are_said_where_lidar_measured_them():
         "ranges along the rays of 2 held-out sweeps: median error in images 0.130 m (65 % within 0.2 m), "
         "on vehicles 0.093 m (65 % within 0.2 m)"
     )
+    seen = with_ranges(make_summary("plain"), 0.1304, 0.654)
+    learned = dataclasses.replace(there(seen.geometry), intensity_error=0.0811, intensity_spread=0.0959)
+    lines = result_lines(dataclasses.replace(seen, geometry=learned), Path("a"))
+    assert lines[1].endswith("0.130 m (65 % within 0.2 m), intensities 0.081 off (0.096 if all were the same)")
     none = result_lines(with_ranges(make_summary("plain"), None, 0.0), Path("a"))
     assert not any("ranges" in line for line in none)
 

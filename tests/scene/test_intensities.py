@@ -44,9 +44,10 @@ def at_balls(shares: list[float], balls: list[int]) -> Tensor:
 
 
 def test_each_row_has_the_mean_of_its_returns_and_others_that_of_the_nearest():
-    """Three returns of ball 0 in two sweeps, one of ball 3; what ends elsewhere along a ray is of something else."""
+    """Three returns of ball 0 in two sweeps, one of ball 3, one of the recording car; what ends elsewhere on a ray is
+    of something else."""
     scene = street()
-    first = sweep(at_balls([1.0, 1.01, 1.0, 0.8], [0, 0, 3, 3])), torch.tensor([0.2, 0.6, 1.0, 0.0])
+    first = sweep(at_balls([0.03, 1.0, 1.01, 1.0, 0.8], [2, 0, 0, 3, 3])), torch.tensor([0.9, 0.2, 0.6, 1.0, 0.0])
     second = sweep(at_balls([0.99, 1.2], [0, 1])), torch.tensor([0.7, 0.9])
     assert learn_intensities(scene, [first, second], OPTIONS) == 2
     # Of balls 1 and 4 ball 0 is the nearest, of ball 2 ball 3.
