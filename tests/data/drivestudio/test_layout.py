@@ -35,6 +35,7 @@ from tests.data.drivestudio.folders import (
     write_matrix,
     write_rows,
 )
+from tests.typed import there
 
 AXES = "neither y (down, OpenCV) nor z (up, Waymo)"
 ODD, EVEN = np.zeros((5, 3)), np.zeros((6, 3))
@@ -243,10 +244,10 @@ def test_intensities_are_those_of_the_points(tmp_path, make, column, brightest):
     rows.tofile(path)
     sweeps = DriveStudioReader(root).read().sweeps
     assert len(sweeps[1].points) == 4
-    np.testing.assert_allclose(sweeps.load_intensities(1), [0.2, 1.0, 0.0, 0.8], atol=1e-6)
+    np.testing.assert_allclose(there(sweeps.load_intensities(1)), [0.2, 1.0, 0.0, 0.8], atol=1e-6)
     if make is make_waymo:
         ahead = DriveStudioReader(root, lidar_ahead=(-6.5, 8.0)).read().sweeps
-        np.testing.assert_allclose(ahead.load_intensities(1), [1.0, 0.0], atol=1e-6)
+        np.testing.assert_allclose(there(ahead.load_intensities(1)), [1.0, 0.0], atol=1e-6)
 
 
 def test_a_flavor_of_unknown_columns_has_no_intensities(tmp_path):
