@@ -167,9 +167,11 @@ class Rows(nn.Module):
 
         Load before you build an optimizer, because parameters of another length are replaced.
         """
-        if prefix + INTENSITIES in state_dict:
-            self.register_buffer(INTENSITIES, torch.empty_like(state_dict[prefix + INTENSITIES]))
-        for name, column in self.columns().items():
+        columns = self.columns()
+        if (learned := state_dict.get(prefix + INTENSITIES)) is not None:
+            device = next(iter(columns.values())).device
+            self.register_buffer(INTENSITIES, torch.empty_like(learned, device=device))
+        for name, column in columns.items():
             saved = state_dict.get(prefix + name)
             if saved is None and name in self.transient:
                 delattr(self, name)
