@@ -165,7 +165,7 @@ def test_training_ends_with_its_result(finished):
 
 def test_costs_of_a_run(finished):
     costs, summary = COSTS.read(finished), SUMMARY.read(finished)
-    stages = {"start", "data", "points", "initialize", "train", "validate", "prune", "save"}
+    stages = {"start", "data", "points", "initialize", "train", "validate", "prune", "intensities", "save"}
     stages |= {"effects", "evaluate", "latency", "costs", "geometry", "gains", "pictures", "other"}
     assert set(costs.phases) == stages
     assert all(seconds > 0 for seconds in costs.phases.values())
