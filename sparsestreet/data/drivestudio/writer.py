@@ -439,6 +439,9 @@ def _points(log: DrivingLog, where: Placement, frame: int) -> bytes:
         sweep_from_world = inverse(where.world_from_sweep[frame]) @ log.dataset_from_world
         first = where.flavor.x_column
         rows[:, first : first + 3] = transform_points(sweep_from_world, sweep.points.double()).numpy()
+        intensities = log.sweeps.load_intensities(frame)
+        if where.flavor.intensity is not None and intensities is not None:
+            rows[:, where.flavor.intensity] = intensities.numpy()
         if where.mounts is not None:
             rows[:, :3], rows[:, _FLOW_CLASS] = where.mounts[0, :3, 3].numpy(), -1
     return rows.astype("<f4").tobytes()

@@ -38,8 +38,10 @@ from tests.data.plan import (
     check_same_track,
     check_same_views,
     in_data_set,
+    levels,
     make_log,
 )
+from tests.typed import there
 
 LOSSLESS = DriveStudioWriter(jpeg_quality=None)
 MAP = np.array([5.4e6, -3.2e5, 40.0])
@@ -56,6 +58,10 @@ def everything(tmp_path) -> DrivingLog:
     """A log with all that the layout has room for: lens, hood, own instants, bodies, far from the world's origin."""
     root = make_nuscenes(tmp_path / "from", frames=4, offset=MAP)
     write_lines(root / "intrinsics/1.txt", [40.0, 41, 20, 12, -0.3, 0.05, 0.002, -0.001, 0.01])
+    for path in (root / "lidar").iterdir():
+        rows = np.fromfile(path, "<f4").reshape(-1, 4)
+        rows[:, 3] = levels(len(rows))
+        rows.tofile(path)
     hood = np.zeros((24, 40), np.uint8)
     hood[-5:] = 255
     write_image(root / "ego_masks/0.png", hood)
@@ -69,6 +75,10 @@ def test_everything_comes_back(everything, tmp_path):
     found = written(everything, tmp_path / "out")
     check_same_views(found, everything)
     check_same_sweeps(found, everything)
+    for index in everything.sweeps.indices:
+        intensities = there(found.sweeps.load_intensities(index))
+        assert intensities.any()
+        assert torch.equal(intensities, there(everything.sweeps.load_intensities(index)))
     for one, other in zip(found.frames, everything.frames, strict=True):
         assert torch.equal(one.image, other.image)
         check_same_masks(one, other)
